@@ -1,0 +1,1 @@
+"""What follows from the Jacobians: local indices, and their integrals over the workspace."""

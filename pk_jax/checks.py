@@ -1,0 +1,69 @@
+"""Bad input is told at the door: one line that names the field, the value and what is allowed.
+
+Shapes are always checked. Values are checked only where they are known, that is, outside of
+`jit`, `grad` and `vmap`; inside, a bad row gets a `Status` instead.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def is_concrete(*trees: Any) -> bool:
+    """True where every leaf has a value that can be read now (no tracer among them)."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def real_array(name: str, value: Any) -> jax.Array:
+    """`value` as a floating-point array. Floats keep their precision, integers become floats."""
+    if isinstance(value, jax.core.Tracer):
+        dtype = value.dtype
+    else:
+        try:
+            dtype = np.asarray(value).dtype
+        except ValueError:  # ragged nested lists
+            raise ValueError(f"{name} must be a number or a regular array, got {value!r}") from None
+    if jnp.issubdtype(dtype, jnp.floating):
+        return jnp.asarray(value)
+    if jnp.issubdtype(dtype, jnp.integer):
+        return jnp.asarray(value, dtype=jnp.result_type(float))
+    raise ValueError(f"{name} must be real numbers, got {_short(value)} ({dtype})")
+
+
+def has_shape(name: str, value: jax.Array, shape: tuple[int | None, ...]) -> None:
+    """`None` in `shape` stands for any size."""
+    fits = len(value.shape) == len(shape) and all(
+        want is None or got == want for got, want in zip(value.shape, shape, strict=True)
+    )
+    if not fits:
+        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+        raise ValueError(f"{name} must have shape {wanted}, got {tuple(value.shape)}")
+
+
+def is_finite(name: str, value: jax.Array) -> None:
+    if not np.all(np.isfinite(value)):
+        raise ValueError(f"{name} must be finite, got {_short(value)}")
+
+
+def is_positive(name: str, value: jax.Array) -> None:
+    if not np.all(np.asarray(value) > 0):
+        raise ValueError(f"{name} must be positive, got {_short(value)}")
+
+
+def is_count(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
+    """`value` as an int within [least, most]; bools, floats and strings are refused."""
+    limit = f">= {least}" if most is None else f"from {least} to {most}"
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise ValueError(f"{name} must be an integer {limit}, got {value!r}")
+    if value < least or (most is not None and value > most):
+        raise ValueError(f"{name} must be an integer {limit}, got {value}")
+    return int(value)
+
+
+def _short(value: Any) -> str:
+    text = " ".join(str(np.asarray(value)).split())
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,1 @@
+"""Poses, their tangents, and elementary functions whose derivatives stay finite."""

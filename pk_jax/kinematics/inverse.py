@@ -1,0 +1,96 @@
+"""Inverse kinematics: the joints of a pose."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from pk_jax import checks
+from pk_jax.kinematics import newton
+from pk_jax.kinematics.batching import all_finite, over_rows, rows_of
+from pk_jax.kinematics.closure import is_closed, joint_scale
+from pk_jax.kinematics.jacobian import joint_jacobian, scaled_jacobians
+from pk_jax.mechanisms.base import Mechanism
+from pk_jax.status import Status
+
+SINGULAR_BELOW = 1e-6  # sine of an angle; a reach limit itself is only known to sqrt(eps)
+
+
+class InverseKinematics(NamedTuple):
+    """One entry a row; batch first."""
+
+    joints: jax.Array  # (m,), NaN unless the status is OK
+    status: jax.Array  # () Status
+    candidate: jax.Array  # (m,) the joints, also where a leg is stretched or folded
+
+
+def inverse_kinematics(
+    mech: Mechanism, pose: Any, branch: Any = None, *, free: Any = None
+) -> InverseKinematics:
+    """Joints that hold the platform at `pose`, in one working mode.
+
+    pose:    like the mechanism's, or batched on a leading axis
+    branch:  signs of the working mode, (m,) or (batch, m); default: the mechanism's own
+    free:    values of kinematically redundant joints, for mechanisms that have them
+
+    Status: OK; UNREACHABLE: no real joints; SINGULAR: a type I singularity (a leg stretched or
+    folded), where the joints exist, in `candidate`, but their rates do not; NONFINITE: NaN or
+    infinity in the pose. Without a closed form the joints come from Newton, started at home
+    (STALLED where that ends elsewhere). The derivative of a row that is not OK is zero.
+    """
+    home_pose, home_joints = jax.eval_shape(mech.home)
+    pose = rows_of("pose", pose, home_pose)
+    batched = (pose.ndim > home_pose.ndim,)
+    if branch is None:
+        return _solve(mech, (pose,), free, batched)
+    branch = rows_of("branch", branch, home_joints)
+    if checks.is_concrete(branch) and not bool(jnp.all(jnp.abs(branch) == 1)):
+        raise ValueError(f"branch must hold only +1 and -1, got {branch}")
+    return _solve(mech, (pose, branch), free, (*batched, branch.ndim > home_joints.ndim))
+
+
+@partial(jax.jit, static_argnums=3)
+def _solve(mech, pose_and_branch, free, are_batched):
+    return over_rows(lambda *row: _one(mech, *row, free=free), pose_and_branch, are_batched)
+
+
+def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = None) -> InverseKinematics:
+    home_pose, home_joints = mech.home()
+    is_given = all_finite(pose)
+    pose = jnp.where(is_given, pose, home_pose)  # lost rows work on the home pose and are masked after
+    if hasattr(mech, "inverse"):
+        joints_at = lambda pose: mech.inverse(pose, branch, free=free)
+        failed = Status.UNREACHABLE
+    else:
+        joints_at = lambda pose: _by_newton(mech, pose)
+        failed = Status.STALLED
+
+    found = lax.stop_gradient(joints_at(lax.stop_gradient(pose)))
+    is_real = all_finite(found)
+    at = lax.stop_gradient(jnp.where(is_real, pose, home_pose))
+    jacobians = scaled_jacobians(lax.stop_gradient(mech), at, jnp.where(is_real, found, home_joints))
+    sigma = jnp.linalg.svd(jacobians.joints, compute_uv=False)[-1]
+    status = jnp.where(sigma < SINGULAR_BELOW, Status.SINGULAR, Status.OK)
+    status = jnp.where(is_real, status, failed)
+    status = jnp.where(is_given, status, Status.NONFINITE).astype(jnp.int32)
+
+    is_ok = status == Status.OK
+    joints = joints_at(jnp.where(is_ok, pose, home_pose))  # what is differentiated never sees a limit
+    return InverseKinematics(
+        jnp.where(is_ok, joints, jnp.nan), status, jnp.where(is_given, found, jnp.nan)
+    )
+
+
+def _by_newton(mech: Mechanism, pose: jax.Array) -> jax.Array:
+    """Joints from the residual alone; NaN where Newton did not end on a root. -> (m,)"""
+    fixed, at = lax.stop_gradient((mech, pose))
+    start = fixed.home()[1]
+    add = lambda joints, step: joints + step
+    linearize = lambda q: (fixed.residual(at, q), joint_jacobian(fixed, at, q))
+    found = newton.solve(linearize, add, start, scale=joint_scale(fixed, start)).point
+    joints = newton.implicit(lambda q: mech.residual(pose, q), add, found, start.size)
+    return jnp.where(is_closed(fixed, at, found), joints, jnp.nan)

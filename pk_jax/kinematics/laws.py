@@ -1,0 +1,225 @@
+"""The laws that every mechanism obeys, ours and yours: `check_mechanism`."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from pk_jax.geometry.poses import retract
+from pk_jax.kinematics.closure import is_closed, joint_scale, pose_scale
+from pk_jax.kinematics.forward import forward_kinematics
+from pk_jax.kinematics.inverse import inverse_kinematics
+from pk_jax.kinematics.jacobian import joint_jacobian, pose_jacobian, scaled_jacobians
+from pk_jax.mechanisms.base import Mechanism
+from pk_jax.status import Status
+
+SAMPLES = 12
+SPREAD = 0.02  # of the natural size of each coordinate: how far from home the laws are tried
+REGULAR_ABOVE = 0.02  # least singular value at home, of the scaled Jacobian
+
+
+class Law(NamedTuple):
+    """One law, how far it was missed, and what is allowed."""
+
+    name: str
+    error: float
+    tolerance: float
+
+    @property
+    def holds(self) -> bool:
+        return self.error <= self.tolerance  # NaN compares False
+
+
+class LawReport(tuple):
+    """The laws in the order they were checked; prints as a table."""
+
+    def __str__(self) -> str:
+        return "\n".join(f"{law.name:<58} {law.error:9.2e} <= {law.tolerance:7.1e}" for law in self)
+
+
+def check_mechanism(mech: Mechanism) -> LawReport:
+    """Check the contract and the laws of kinematics on a mechanism, near its home.
+
+    Returns the report of all laws; raises ValueError, one line that names the first broken law,
+    its error and the tolerance, or the contract method whose answer has the wrong shape. Call it
+    with float64 enabled: the tolerances come from the precision in use.
+    """
+    if not isinstance(mech, Mechanism):
+        raise ValueError(f"check_mechanism takes a pk_jax.Mechanism, got {type(mech).__name__}")
+    name = type(mech).__name__
+    _check_contract(mech, name)
+    laws = LawReport(Law(what, float(error), float(allowed)) for what, error, allowed in _laws(mech))
+    for law in laws:
+        if not law.holds:
+            raise ValueError(
+                f"{name} breaks a law: {law.name}; error {law.error:.3g}, allowed {law.tolerance:.3g}"
+            )
+    return laws
+
+
+def _check_contract(mech: Mechanism, name: str) -> None:
+    pose, joints = mech.home()
+    value = mech.residual(pose, joints)
+    n, m, c = pose.shape[0], joints.shape[0], value.shape[0] if value.ndim else 0
+    if value.ndim != 1 or c < n:
+        raise ValueError(f"{name}.residual must have shape (c,) with c >= n = {n}, got {value.shape}")
+    for units, count, attribute in ((mech.joint_units, m, "joint_units"), (mech.pose_units, n, "pose_units")):
+        if units is not None and (len(units) != count or set(units) - {0, 1}):
+            raise ValueError(f"{name}.{attribute} must be {count} numbers, 1 = length and 0 = angle, got {units}")
+    f, a = mech.linearize(pose, joints)
+    if f.shape != (c,) or a.shape != (c, n):
+        raise ValueError(f"{name}.linearize must give shapes {(c,)} and {(c, n)}, got {f.shape} and {a.shape}")
+    if not (mech.length().shape == () and mech.length() > 0):
+        raise ValueError(f"{name}.length must be one positive number, got {mech.length()}")
+    margins = mech.margins(pose, joints)
+    if not isinstance(margins, dict):
+        raise ValueError(f"{name}.margins must be a dict of named arrays, got {type(margins).__name__}")
+    points, segments, ground = mech.skeleton(pose, joints)
+    if points.ndim != 2 or points.shape[1] not in (2, 3):
+        raise ValueError(f"{name}.skeleton points must have shape (p, 2) or (p, 3), got {points.shape}")
+    indices = {index for segment in segments for index in segment} | set(ground)
+    if not indices <= set(range(points.shape[0])):
+        raise ValueError(f"{name}.skeleton names points that it does not have: {sorted(indices)}")
+    if hasattr(mech, "inverse") and mech.inverse(pose).shape != (m,):
+        raise ValueError(f"{name}.inverse must have shape {(m,)}, got {mech.inverse(pose).shape}")
+    if hasattr(mech, "forward"):
+        poses, is_real = mech.forward(joints)
+        if poses.shape[1:] != (n,) or is_real.shape != poses.shape[:1]:
+            raise ValueError(
+                f"{name}.forward must give poses (modes, {n}) and is_real (modes,), "
+                f"got {poses.shape} and {is_real.shape}"
+            )
+
+
+def _laws(mech: Mechanism):
+    """Yield (law, error, tolerance); the errors are dimensionless."""
+    eps = float(jnp.finfo(mech.length().dtype).eps)
+    exact, differences = 1e4 * eps, 2e2 * eps ** (2 / 3)
+    tolerances = {
+        "home is regular: 0.02 / least singular value of A": 1.0,
+        "home is inside every margin": exact,
+        "a batch equals a loop: inverse kinematics": exact,
+        "forward kinematics of inverse kinematics is the identity": exact,
+        "a batch equals a loop: forward kinematics": exact,
+        "the closed-form modes contain the pose": 1e2 * exact,
+        "every closed-form mode closes the loops": 1e2 * exact,
+        "linearize gives dF/dx of the residual": exact,
+        "A against central differences": differences,
+        "B against central differences": differences,
+        "velocities: A x' + B q' = 0": exact,
+        "the derivatives of FK and IK are inverses": exact,
+        "power balance": exact,
+    }
+    for name, error in _errors(mech).items():
+        yield name, error, tolerances.get(name, 0.0)  # the others are counts: none is allowed
+
+
+def _errors(mech: Mechanism) -> dict[str, jax.Array]:
+    names = []
+
+    @jax.jit  # one compilation for all laws
+    def measure(mech):
+        found = dict(_measure(mech))
+        names.extend(found)  # jit would sort a dict
+        return list(found.values())
+
+    values = measure(mech)
+    return dict(zip(names, values, strict=True))
+
+
+def _measure(mech: Mechanism):
+    """Yield (law, error); traced once."""
+    home, home_joints = mech.home()
+    eps = float(jnp.finfo(home.dtype).eps)
+    dx, dq = pose_scale(mech, home), joint_scale(mech, home_joints)
+    n = home.shape[0]
+
+    yield "home closes every loop", ~is_closed(mech, home, home_joints)
+    least = jnp.linalg.svd(scaled_jacobians(mech, home, home_joints).pose, compute_uv=False)[-1]
+    yield "home is regular: 0.02 / least singular value of A", REGULAR_ABOVE / least
+    margins = [jnp.min(v) for v in mech.margins(home, home_joints).values()]
+    yield "home is inside every margin", -jnp.min(jnp.stack([*margins, jnp.zeros_like(least)]))
+
+    leaves, tree = jax.tree.flatten(mech)
+    rebuilt = jax.tree.unflatten(tree, leaves)
+    same = rebuilt.residual(home, home_joints) == mech.residual(home, home_joints)
+    yield "a pytree: flatten and unflatten change nothing", jnp.sum(~same)
+
+    poses = home + SPREAD * dx * _spread(SAMPLES, n, home.dtype)
+    solved = inverse_kinematics(mech, poses)
+    joints = solved.joints
+    yield "inverse kinematics is OK near home (rows lost)", _lost(solved.status)
+    closed = jax.vmap(lambda x, q: is_closed(mech, x, q))(poses, joints)
+    yield "inverse kinematics closes every loop (rows open)", jnp.sum(~closed)
+    looped = lax.map(lambda x: inverse_kinematics(mech, x).joints, poses)
+    yield "a batch equals a loop: inverse kinematics", _gap(joints, looped, dq)
+
+    found = forward_kinematics(mech, joints)
+    yield "forward kinematics is OK near home (rows lost)", _lost(found.status)
+    yield "forward kinematics of inverse kinematics is the identity", _gap(found.pose, poses, dx)
+    looped = lax.map(lambda q: forward_kinematics(mech, q).pose, joints)
+    yield "a batch equals a loop: forward kinematics", _gap(found.pose, looped, dx)
+
+    a, b = pose_jacobian(mech, poses[0], joints[0]), joint_jacobian(mech, poses[0], joints[0])
+    size = (jnp.abs(a) @ dx)[:, None]  # of each closure equation
+    if hasattr(mech, "forward"):
+        modes, is_real = jax.vmap(mech.forward)(joints)
+        gaps = jnp.max(jnp.abs(modes - poses[:, None]) / dx, axis=-1)
+        yield "the closed-form modes contain the pose", jnp.max(jnp.min(jnp.where(is_real, gaps, jnp.inf), 1))
+        assembled = jax.vmap(lambda xs, q: jax.vmap(lambda x: mech.residual(x, q))(xs))(modes, joints)
+        off = jnp.where(is_real[..., None], jnp.abs(assembled) / size[:, 0], 0)
+        yield "every closed-form mode closes the loops", jnp.max(off)
+
+    pose, q = poses[0], joints[0]
+    plain = jax.jacfwd(lambda twist: mech.residual(retract(pose, twist), q))(jnp.zeros_like(pose))
+    yield "linearize gives dF/dx of the residual", _gap(a * dx, plain * dx, size)
+    central = _central(lambda t: mech.residual(retract(pose, t * dx), q), n, eps ** (1 / 3), pose.dtype)
+    yield "A against central differences", _gap(a * dx, central, size)
+    central = _central(lambda t: mech.residual(pose, q + t * dq), q.shape[0], eps ** (1 / 3), q.dtype)
+    yield "B against central differences", _gap(b * dq, central, size)
+
+    rate = jax.jacfwd(lambda x: inverse_kinematics(mech, x).joints)(pose)
+    yield "velocities: A x' + B q' = 0", jnp.max(jnp.abs((a + b @ rate) * dx) / size)
+    back = jax.jacfwd(lambda q: forward_kinematics(mech, q).pose)(q)
+    yield "the derivatives of FK and IK are inverses", _gap(back @ rate * dx / dx[:, None], jnp.eye(n), 1)
+    load, velocity = _spread(2, n, pose.dtype)
+    load, velocity = load / dx, velocity * dx
+    torques = back.T @ load  # virtual work: torques . q' = load . x'
+    yield "power balance", jnp.abs(torques @ (rate @ velocity) - load @ velocity)
+
+    gradient = jax.grad(lambda g: jnp.sum(inverse_kinematics(g, pose).joints / dq))(mech)
+    infinite = [jnp.sum(~jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)]
+    yield "derivatives in the geometry are finite (entries lost)", sum(infinite)
+
+    poisoned = inverse_kinematics(mech, poses.at[1].set(jnp.nan))
+    yield "a NaN row is told", poisoned.status[1] != Status.NONFINITE
+    others = np.delete(np.arange(SAMPLES), 1)
+    yield "a NaN row changes no other row", jnp.sum(poisoned.joints[others] != joints[others])
+
+
+def _central(function, count: int, step: float, dtype) -> jax.Array:
+    """Central differences of `function` (count,) -> (c,) at zero. -> (c, count)"""
+    units = step * jnp.eye(count, dtype=dtype)
+    return jnp.stack([(function(u) - function(-u)) / (2 * step) for u in units], axis=1)
+
+
+def _spread(rows: int, columns: int, dtype) -> jax.Array:
+    """Evenly spread points in [-1, 1]^columns, the same every time (an additive sequence)."""
+    root = 2.0
+    for _ in range(30):
+        root = (1 + root) ** (1 / (columns + 1))
+    steps = root ** -np.arange(1, columns + 1)
+    points = (0.5 + np.arange(1, rows + 1)[:, None] * steps) % 1
+    return jnp.asarray(2 * points - 1, dtype)
+
+
+def _gap(a, b, scale) -> jax.Array:
+    return jnp.max(jnp.abs(a - b) / scale)
+
+
+def _lost(status: jax.Array) -> jax.Array:
+    return jnp.sum(status != Status.OK)

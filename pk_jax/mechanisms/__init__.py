@@ -1,0 +1,1 @@
+"""The contract (`base.py`), and one file per mechanism family."""

@@ -1,0 +1,153 @@
+"""The contract of a mechanism.
+
+A mechanism says only what is particular to it: its geometry (the fields) and ONE constraint
+residual. Every analysis is a free function whose first argument is a mechanism. Subclassing
+`Mechanism` turns the class into a frozen keyword-only dataclass and a JAX pytree whose leaves are
+the geometry, so `jax.grad(f)(mechanism)` is itself a mechanism: one of gradients.
+
+All methods are written for ONE configuration; callers vmap.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import typing
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pk_jax import checks
+from pk_jax.geometry.poses import place, place_jacobian, retract, tangent_zero
+
+
+class Skeleton(NamedTuple):
+    """A mechanism as a drawing: points, and the index pairs that bars connect."""
+
+    points: jax.Array  # (p, 2) or (p, 3)
+    segments: tuple[tuple[int, int], ...]
+    ground: tuple[int, ...] = ()  # the points that stand on the base
+
+
+@typing.dataclass_transform(frozen_default=True, kw_only_default=True, eq_default=False)
+class Mechanism(abc.ABC):
+    """Base class of every mechanism; see CONTRIBUTING for a complete example.
+
+    Symbols used throughout: pose x with n tangent coordinates, joints q (m,), residual F (c,),
+    A = dF/dx (c, n), B = dF/dq (c, m), c >= n.
+    """
+
+    joint_units: ClassVar[tuple[int, ...] | None] = None  # 1 = length, 0 = angle; None = all lengths
+    pose_units: ClassVar[tuple[int, ...] | None] = None  # the same for the tangent of the pose
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)(cls)
+        names = tuple(field.name for field in dataclasses.fields(cls))
+
+        def flatten(mechanism):
+            keys = jax.tree_util.GetAttrKey
+            return tuple((keys(name), getattr(mechanism, name)) for name in names), None
+
+        def unflatten(_, leaves):  # JAX rebuilds with tracers: only callers meet __post_init__
+            mechanism = object.__new__(cls)
+            for name, leaf in zip(names, leaves, strict=True):
+                object.__setattr__(mechanism, name, leaf)
+            return mechanism
+
+        jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten)
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if value is not None:
+                array = checks.real_array(f"{type(self).__name__}.{field.name}", value)
+                object.__setattr__(self, field.name, array)
+        self.check_shapes()
+        if checks.is_concrete(self):
+            for field in dataclasses.fields(self):
+                if (value := getattr(self, field.name)) is not None:
+                    checks.is_finite(f"{type(self).__name__}.{field.name}", value)
+            self.check_values()
+
+    def __repr__(self) -> str:
+        def show(value):
+            return np.asarray(value).tolist() if isinstance(value, jax.Array) else value
+
+        fields = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
+        inside = ", ".join(
+            f"{name}={value if not checks.is_concrete(value) else show(value)}" for name, value in fields
+        )
+        return f"{type(self).__name__}({inside})"
+
+    def check_shapes(self) -> None:
+        """Raise ValueError where a field has the wrong shape. Always called."""
+
+    def check_values(self) -> None:
+        """Raise ValueError where a geometry is impossible. Called only on known values."""
+
+    @abc.abstractmethod
+    def residual(self, pose: Any, joints: jax.Array) -> jax.Array:
+        """The closure equations F(x, q; geometry), zero on a configuration. -> (c,)"""
+
+    @abc.abstractmethod
+    def home(self) -> tuple[Any, jax.Array]:
+        """A regular reference configuration, the pose under stop_gradient. -> (pose, joints)"""
+
+    @abc.abstractmethod
+    def length(self) -> jax.Array:
+        """A characteristic length. -> () m"""
+
+    @abc.abstractmethod
+    def margins(self, pose: Any, joints: jax.Array) -> dict[str, jax.Array]:
+        """Named, dimensionless distances to the limits, >= 0 inside; {} where none are known."""
+
+    @abc.abstractmethod
+    def skeleton(self, pose: Any, joints: jax.Array) -> Skeleton:
+        """What to draw."""
+
+    # Optional: a mechanism with a closed form defines
+    #     inverse(pose, branch=None, *, free=None) -> joints, NaN where unreachable
+    #     forward(joints) -> (poses, is_real), every assembly mode, fixed shape
+
+    def linearize(self, pose: Any, joints: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """F and A = dF/dx in the tangent of the pose. -> (c,), (c, n)"""
+
+        def moved(twist):
+            value = self.residual(retract(pose, twist), joints)
+            return value, value
+
+        jacobian, value = jax.jacfwd(moved, has_aux=True)(tangent_zero(pose))
+        return value, jacobian
+
+
+class LegMechanism(Mechanism):
+    """A mechanism whose legs each see ONE platform point.
+
+    It states `attachments` and `legs`; the residual and its linearization follow. The gradient of
+    a leg's equation with respect to its platform point is the force of the leg's wrench line, so
+    one vector-Jacobian product gives all of them, and the rigid-body map turns them into A.
+    """
+
+    @abc.abstractmethod
+    def attachments(self) -> jax.Array:
+        """Where the legs meet the platform, in the platform frame. -> (k, d)"""
+
+    @abc.abstractmethod
+    def legs(self, points: jax.Array, joints: jax.Array) -> jax.Array:
+        """Closure of every leg; row i sees points[i] (d,) only. -> (k,) or (k, e)"""
+
+    def residual(self, pose: Any, joints: jax.Array) -> jax.Array:
+        return self.legs(place(pose, self.attachments()), joints).reshape(-1)
+
+    def linearize(self, pose: Any, joints: jax.Array) -> tuple[jax.Array, jax.Array]:
+        attachments = self.attachments()
+        points = place(pose, attachments)
+        value, pull_back = jax.vjp(lambda p: self.legs(p, joints).reshape(points.shape[0], -1), points)
+        equations = value.shape[1]  # a leg
+        seeds = jnp.broadcast_to(jnp.eye(equations, dtype=value.dtype)[:, None], (equations, *value.shape))
+        forces = jax.vmap(lambda seed: pull_back(seed)[0])(seeds)  # (e, k, d)
+        rows = jnp.einsum("ekd,kdn->ken", forces, place_jacobian(pose, attachments))
+        return value.reshape(-1), rows.reshape(-1, rows.shape[-1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 from jax import lax
 
 ROWS_AT_ONCE = 16  # fits the cache with some thousand nodes a row
@@ -45,8 +46,20 @@ def in_chunks(function: Callable) -> Callable:
     def rule(axis_size, in_batched, rows):
         if not in_batched[0]:  # a derivative of it is batched, it is not
             answers = function(rows)
+        elif axis_size <= ROWS_AT_ONCE:
+            answers = jax.vmap(function)(rows)
         else:
-            answers = lax.map(function, rows, batch_size=min(ROWS_AT_ONCE, axis_size))
+            answers = _loop(function, rows)
         return answers, jax.tree.map(lambda _: in_batched[0], answers)
 
     return call
+
+
+def _loop(function: Callable, rows: jax.Array):
+    """vmap in equal chunks; the last is filled up with copies of the last row."""
+    count = rows.shape[0]
+    chunks = -(-count // ROWS_AT_ONCE)
+    fill = jnp.broadcast_to(rows[-1:], (chunks * ROWS_AT_ONCE - count, *rows.shape[1:]))
+    filled = jnp.concatenate([rows, fill]).reshape(chunks, ROWS_AT_ONCE, *rows.shape[1:])
+    answers = lax.map(jax.vmap(function), filled)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], answers)

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from pk_jax import checks
 from pk_jax.geometry import safe
 from pk_jax.kinematics.batching import over_rows, rows_of
-from pk_jax.kinematics.inverse import SINGULAR_BELOW, inverse_kinematics
+from pk_jax.kinematics.inverse import SINGULAR_BELOW, branch_rows, inverse_kinematics
 from pk_jax.kinematics.jacobian import ScaledJacobians, scaled_jacobians, units
 from pk_jax.mechanisms.base import Mechanism
 from pk_jax.status import Status
@@ -44,9 +43,7 @@ def local_indices(mech: Mechanism, pose: Any, branch: Any = None) -> LocalIndice
     batched = (pose.ndim > home_pose.ndim,)
     if branch is None:
         return _local(mech, (pose,), batched)
-    branch = rows_of("branch", branch, home_joints)
-    if checks.is_concrete(branch) and not bool(jnp.all(jnp.abs(branch) == 1)):
-        raise ValueError(f"branch must hold only +1 and -1, got {branch}")
+    branch = branch_rows(branch, home_joints)
     return _local(mech, (pose, branch), (*batched, branch.ndim > home_joints.ndim))
 
 

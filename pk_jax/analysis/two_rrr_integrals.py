@@ -41,6 +41,7 @@ class _Links(NamedTuple):
     l_min: jax.Array
     l_max: jax.Array
     phi_max: jax.Array
+    half_limit: tuple[jax.Array, jax.Array]  # sine and cosine of phi_max / 2
 
 
 def integrals(l_min: jax.Array, v: jax.Array, outer: int, inner: int) -> Integrals:
@@ -66,31 +67,39 @@ def integrals(l_min: jax.Array, v: jax.Array, outer: int, inner: int) -> Integra
 
 def _links(l_min, v) -> _Links:
     excess = v * v
-    l_max = l_min + 2
     # tan^2(phi_max / 2) = (l_max^2 - l_min^2) / (l_min^2 - (lb - la)^2), without its cancellation
-    phi_max = 2 * jnp.arctan2(jnp.sqrt(l_min + 1), v * jnp.sqrt(l_min - excess))
-    return _Links(1 + excess, l_min + 1 - excess, l_min, l_max, phi_max)
+    sine, cosine = jnp.sqrt(l_min + 1), v * jnp.sqrt(l_min - excess)
+    size = jnp.sqrt(sine**2 + cosine**2)
+    phi_max = 2 * jnp.arctan2(sine, cosine)
+    return _Links(1 + excess, l_min + 1 - excess, l_min, l_min + 2, phi_max, (sine / size, cosine / size))
 
 
 def _densities(links: _Links, a, phi1, away2) -> tuple[jax.Array, jax.Array, jax.Array]:
     """1/kappa, 1/|det J| and 1, each times dW / dphi1 dphi2, over both halves of the workspace.
 
-    away2 = phi_max - phi2 is given apart from phi1, because both ends are approached closely.
-    gamma is the angle between the distal links at the end point, Gamma that between the legs, and
-    alpha_i that between leg and distal link: gamma = Gamma + alpha1 + alpha2.
+    away2 = phi_max - phi2 is given apart from phi1, because both ends are approached closely, and
+    every sum of half angles is expanded so that nothing cancels there. gamma is the angle between
+    the distal links at the end point, Gamma that between the legs, and alpha_i that between leg and
+    distal link: gamma = Gamma + alpha1 + alpha2.
     """
-    la, lb, l_min, l_max, phi_max = links
-    phi2, away1 = a + phi1, a + away2
-    sin1, cos1, sin2, cos2 = jnp.sin(phi1), jnp.cos(phi1), jnp.sin(phi2), jnp.cos(phi2)
+    la, lb, l_min, l_max, sin_limit, cos_limit = links.la, links.lb, links.l_min, links.l_max, *links.half_limit
+    sin_a, cos_a = jnp.sin(a / 2), jnp.cos(a / 2)
+    sin_p, cos_p = jnp.sin(phi1 / 2), jnp.cos(phi1 / 2)  # p, q: the halves of phi1, phi2
+    sin_w, cos_w = jnp.sin(away2 / 2), jnp.cos(away2 / 2)
+    sin_q = sin_a * cos_p + cos_a * sin_p
+    cos_q = cos_limit * cos_w + sin_limit * sin_w
+    sin1, cos1 = 2 * sin_p * cos_p, 1 - 2 * sin_p**2
+    sin2, cos2 = 2 * sin_q * cos_q, 1 - 2 * sin_q**2
+
     p1, q1, p2, q2 = lb + la * cos1, la * sin1, lb + la * cos2, la * sin2  # l_i e^(i alpha_i)
     l1, l2 = jnp.sqrt(p1**2 + q1**2), jnp.sqrt(p2**2 + q2**2)
-    # distances of the leg lengths from their limits, free of cancellation
-    below_max1 = 4 * la * lb * jnp.sin(phi1 / 2) ** 2 / (l_max + l1)
-    above_min = lambda l, away: 4 * la * lb * jnp.sin(away / 2) * jnp.sin(phi_max - away / 2) / (l + l_min)
-    above1, above2 = above_min(l1, away1), above_min(l2, away2)
+    # distances of the leg lengths from their limits: differences of cosines as products of sines
+    below_max1 = 4 * la * lb * sin_p**2 / (l_max + l1)
+    above_min1 = 4 * la * lb * (sin_a * cos_w + cos_a * sin_w) * (sin_limit * cos_p + cos_limit * sin_p) / (l1 + l_min)
+    above_min2 = 4 * la * lb * sin_w * (sin_limit * cos_q + cos_limit * sin_q) / (l2 + l_min)
     # 16 y^2 = ((l1 + l2)^2 - 4) (4 - (l1 - l2)^2)
-    tall = (l1 + l2 + 2) * (above1 + above2 + 2 * (l_min - 1))
-    y = jnp.sqrt(tall * (2 + l1 - l2) * (below_max1 + above2)) / 4
+    tall = (l1 + l2 + 2) * (above_min1 + above_min2 + 2 * (l_min - 1))
+    y = jnp.sqrt(tall * (2 + l1 - l2) * (below_max1 + above_min2)) / 4
 
     real, imaginary = p1 * p2 - q1 * q2, p1 * q2 + q1 * p2
     half = (l1**2 + l2**2 - 4) / 2  # l1 l2 cos(Gamma); l1 l2 sin(Gamma) = 2 y
@@ -100,10 +109,9 @@ def _densities(links: _Links, a, phi1, away2) -> tuple[jax.Array, jax.Array, jax
 
     both = 2 * sin1 * sin2
     determinant, total = both * sin_gamma, sin1**2 + sin2**2
-    # total - determinant as a sum of squares; sin1 - sin2 = -2 sin(a / 2) cos((phi1 + phi2) / 2)
-    spread_out = 4 * (jnp.sin(a / 2) * jnp.cos((phi1 + phi2) / 2)) ** 2
-    spread_out = spread_out + both * cos_gamma**2 / (1 + sin_gamma)
-    isotropy = determinant / (total + safe.sqrt((total + determinant) * spread_out))
+    # total - determinant as a sum of squares; sin1 - sin2 = -2 sin(a / 2) cos(p + q)
+    apart = 4 * (sin_a * (cos_p * cos_q - sin_p * sin_q)) ** 2 + both * cos_gamma**2 / (1 + sin_gamma)
+    isotropy = determinant / (total + safe.sqrt((total + determinant) * apart))
 
     measure = (la * lb) ** 2 * sin1 * sin2 / y
     return measure * isotropy, lb**2 * sin_gamma / y, measure

@@ -23,7 +23,7 @@ from pk_jax.mechanisms.five_bar import FiveBar
 from pk_jax.mechanisms.two_rpr import TwoRPR
 from pk_jax.status import Status
 
-MOST_NODES = 4096  # per direction
+MOST_NODES = {"gauss": 512, "midpoint": 20_000, "paper": 20_000}  # per direction: bounds the memory
 COARSER = {24: 16, 10: 8, 8: 6}  # the second rule of the error estimate; otherwise two thirds
 
 
@@ -79,9 +79,10 @@ def workspace_indices(
     if not isinstance(nodes, tuple | list) or len(nodes) != 2:
         raise ValueError(f"nodes must be two integers (outer, inner), got {nodes!r}")
     least = 4 if rule == "paper" else 2
-    nodes = tuple(checks.is_count("nodes", count, least=least, most=MOST_NODES) for count in nodes)
+    nodes = tuple(checks.is_count("nodes", count, least=least, most=MOST_NODES[rule]) for count in nodes)
     if checks.is_concrete(mech):
-        _require_admissible(mech)
+        with jax.ensure_compile_time_eval():
+            _require_admissible(mech)
     return _indices(mech, rule, nodes)
 
 
@@ -148,7 +149,8 @@ def _some_design(mech: Mechanism) -> Mechanism:
 
 def _coordinates(mech: Mechanism) -> tuple[jax.Array, jax.Array]:
     """(l_min, v) at R = 1. Roundoff outside the admissible designs is brought back in."""
-    l_min = jnp.maximum(_stroke(mech)[0] / mech.half_base, 1)
+    l_min = _stroke(mech)[0] / mech.half_base
+    l_min = jnp.where(l_min >= 1, l_min, 1)  # jnp.maximum would halve the derivative at 1
     if isinstance(mech, TwoRPR):
         return l_min, jnp.zeros_like(l_min)
     if mech.slack is not None:

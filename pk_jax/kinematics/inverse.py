@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from pk_jax import checks
@@ -47,10 +48,16 @@ def inverse_kinematics(
     batched = (pose.ndim > home_pose.ndim,)
     if branch is None:
         return _solve(mech, (pose,), free, batched)
-    branch = rows_of("branch", branch, home_joints)
-    if checks.is_concrete(branch) and not bool(jnp.all(jnp.abs(branch) == 1)):
-        raise ValueError(f"branch must hold only +1 and -1, got {branch}")
+    branch = branch_rows(branch, home_joints)
     return _solve(mech, (pose, branch), free, (*batched, branch.ndim > home_joints.ndim))
+
+
+def branch_rows(branch: Any, home_joints: jax.Array) -> jax.Array:
+    """Signs of a working mode, (m,) or (batch, m); ValueError where they are not signs."""
+    array = rows_of("branch", branch, home_joints)
+    if checks.is_concrete(array) and not np.all(np.abs(np.asarray(array)) == 1):
+        raise ValueError(f"branch must hold only +1 and -1, got {np.asarray(array).tolist()}")
+    return array
 
 
 @partial(jax.jit, static_argnums=3)

@@ -67,10 +67,11 @@ class Mechanism(abc.ABC):
                 object.__setattr__(self, field.name, array)
         self.check_shapes()
         if checks.is_concrete(self):
-            for field in dataclasses.fields(self):
-                if (value := getattr(self, field.name)) is not None:
-                    checks.is_finite(f"{type(self).__name__}.{field.name}", value)
-            self.check_values()
+            with jax.ensure_compile_time_eval():  # known values stay known inside a jit
+                for field in dataclasses.fields(self):
+                    if (value := getattr(self, field.name)) is not None:
+                        checks.is_finite(f"{type(self).__name__}.{field.name}", value)
+                self.check_values()
 
     def __repr__(self) -> str:
         def show(value):

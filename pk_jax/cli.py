@@ -1,0 +1,185 @@
+"""pk-jax: parse, call one function, print or save.
+
+Exit codes: 0 good, 2 bad input, 4 file system, 5 numerical stop, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+BAD_INPUT, FILE_SYSTEM, NUMERICAL, INTERRUPTED = 2, 4, 5, 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    try:
+        return options.run(options)
+    except ValueError as error:
+        return _fail(BAD_INPUT, str(error))
+    except BrokenPipeError:  # the reader of our output has gone, e.g. `| head`
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        where = f": {error.filename}" if error.filename else ""
+        return _fail(FILE_SYSTEM, f"{error.strerror or error}{where}")
+    except FloatingPointError as error:
+        return _fail(NUMERICAL, str(error))
+    except KeyboardInterrupt:
+        return _fail(INTERRUPTED, "interrupted")
+
+
+def _fail(code: int, message: str) -> int:
+    print(f"pk-jax: {' '.join(message.split())}", file=sys.stderr)
+    return code
+
+
+# --- the commands; jax is imported only when one runs
+
+
+def _reproduce(options: argparse.Namespace) -> int:
+    progress = _begin()
+    from pk_jax.papers.nam2006_report import as_text, reproduce_into
+
+    found = reproduce_into(options.out, report=progress, say=progress.say)
+    progress.close()
+    print(as_text(found))
+    print(f"\ntables and figures: {options.out}")
+    return 0 if all(cell.verdict != "differs" for cell in found.cells) else NUMERICAL
+
+
+def _workspace(options: argparse.Namespace) -> int:
+    _begin()
+    import pk_jax as pk
+
+    mech = _mechanism(options)
+    nodes = None if options.nodes is None else tuple(options.nodes)
+    found = pk.workspace_indices(mech, options.rule, nodes)
+    print(f"{mech!r}\nrule {options.rule}")
+    for name in ("gii", "gri", "sui", "area"):
+        error = float(getattr(found.error, name))
+        estimate = f"  +- {error:.1e}" if error == error else ""
+        print(f"{name:5}{float(getattr(found, name)):.12g}{estimate}")
+    return 0
+
+
+def _optimize(options: argparse.Namespace) -> int:
+    progress = _begin()
+    import pk_jax as pk
+
+    space = pk.design_space(options.space)
+    result = pk.optimize_design(
+        space, options.weights, starts=options.starts, steps=options.steps, report=progress
+    )
+    progress.close()
+    print(result.mechanism)
+    for name, value in zip(space.variables, result.vector, strict=True):
+        print(f"{name:11}{value:.9g}")
+    for name in ("gii", "gri", "sui"):
+        print(f"{name:11}{float(getattr(result.indices, name)):.9g}")
+    print(f"objective  {result.objective:.9g}\ncpi        {result.cpi:.9g}")
+    for name in result.active:
+        print(f"active     {name}, multiplier {result.multipliers[name]:.9g}")
+    print(f"kkt        {result.kkt:.1e}")
+    print(f"evaluations of value and gradient: {result.evaluations}, all starts {result.evaluations_in_all}")
+    print(f"status     {result.status.name}")
+    return 0 if result.status == pk.Status.OK else NUMERICAL
+
+
+def _mechanism(options: argparse.Namespace):
+    """The 2-RPR or 2-RRR that the options describe, eqs. (20) and (22) filled in."""
+    import pk_jax as pk
+
+    if options.mechanism in ("2-rpr", "2-rrr"):
+        if options.l_min is None:
+            raise ValueError(f"--l-min is needed for {options.mechanism}")
+        r, l_min = options.half_base, options.l_min
+        l_max = l_min + 2 * r if options.l_max is None else options.l_max
+        if options.mechanism == "2-rpr":
+            if options.proximal is not None:
+                raise ValueError("--proximal is for 2-rrr only")
+            return pk.TwoRPR(half_base=r, l_min=l_min, l_max=l_max)
+        proximal = r if options.proximal is None else options.proximal
+        return pk.FiveBar(half_base=r, proximal=proximal, distal=l_max - proximal, reach=(l_min, l_max))
+    if options.l_min is not None or options.l_max is not None or options.proximal is not None:
+        raise ValueError(f"{options.mechanism} is a catalogue entry and takes no lengths")
+    return pk.catalogued(options.mechanism)
+
+
+def _list(options: argparse.Namespace) -> int:
+    from pk_jax.mechanisms.catalogue import CATALOGUE
+
+    for name, entry in CATALOGUE.items():
+        print(f"{name:22}{entry.source}")
+    return 0
+
+
+def _begin():
+    """What every computing command needs: float64, a compile cache of its own, a progress line."""
+    import jax
+
+    from pk_jax.files.progress import Progress
+    from pk_jax.precision import enable_x64
+
+    enable_x64()
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pk_jax"
+    with contextlib.suppress(OSError, RuntimeError):
+        cache.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if (state := cache.stat()).st_uid == os.getuid() and not state.st_mode & 0o077:
+            jax.config.update("jax_compilation_cache_dir", str(cache))
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    return Progress()
+
+
+# --- the command line
+
+
+class _Parser(argparse.ArgumentParser):
+    """Errors in one line, like all others."""
+
+    def error(self, message: str):
+        self.exit(BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="pk-jax", description="Differentiable kinematics of parallel mechanisms.", allow_abbrev=False
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(name, run, text):
+        sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
+        sub.set_defaults(run=run)
+        return sub
+
+    sub = command("reproduce", _reproduce, "Nam, Lee and Park 2006: both tables, Figs. 1-7, and better optima")
+    sub.add_argument("--out", default="runs/nam2006", metavar="DIR", help="run folder (default: %(default)s)")
+
+    sub = command("workspace", _workspace, "GII, GRI and SUI of a 2-RPR or 2-RRR")
+    sub.add_argument("mechanism", help="2-rpr, 2-rrr, or a catalogue entry (see: pk-jax list)")
+    sub.add_argument("--half-base", type=float, default=1.0, help="R (default: 1)")
+    sub.add_argument("--l-min", type=float, help="least distance from a base joint to the end point")
+    sub.add_argument("--l-max", type=float, help="greatest distance (default: l_min + 2 R, eq. 20)")
+    sub.add_argument("--proximal", type=float, help="driven link of the 2-rrr (default: R)")
+    sub.add_argument("--rule", default="gauss", help="gauss, midpoint or paper (default: gauss)")
+    sub.add_argument("--nodes", type=int, nargs=2, metavar=("OUTER", "INNER"), help="nodes of the rule")
+
+    sub = command("optimize", _optimize, "maximize the composite index of a design space by gradients")
+    sub.add_argument("space", help="2-rpr or 2-rrr")
+    sub.add_argument("--weights", type=float, nargs=3, default=(1.0, 1.0, 1.0), metavar=("GII", "GRI", "SUI"))
+    sub.add_argument("--starts", type=int, default=12, help="number of starts (default: %(default)s)")
+    sub.add_argument("--steps", type=int, default=100, help="most evaluations a start (default: %(default)s)")
+
+    command("list", _list, "the catalogue of published designs")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Design variables, the composite index, and its maximization by gradients."""

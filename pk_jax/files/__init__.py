@@ -1,0 +1,1 @@
+"""What touches the disk and the terminal: run folders, written atomically, and progress lines."""

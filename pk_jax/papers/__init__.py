@@ -1,0 +1,1 @@
+"""Published results, computed again and compared cell by cell."""

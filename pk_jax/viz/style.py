@@ -35,6 +35,7 @@ def in_units_of_r(symbol: str, mech: Mechanism, power: int = 1) -> str:
 
 
 def is_unit(mech: Mechanism) -> bool:
+    """Whether the mechanism's lengths are multiples of R."""
     return bool(np.asarray(mech.half_base) == 1)
 
 

@@ -123,7 +123,9 @@ def panoramic_figure(mech: TwoDof, count: int = 17) -> Figure:
     Driven links, or legs, blue; distal links grey. Lengths in the mechanism's unit.
     """
     inner, outer = boundary(mech, boundary_angles(mech, count))
-    outside, inside = (_skeletons(mech, jnp.asarray(poses), _joints(mech, poses)) for poses in (outer, inner))
+    outside, inside = (
+        np.asarray(_skeletons(mech, jnp.asarray(poses), _joints(mech, poses))) for poses in (outer, inner)
+    )
     width, height = np.ptp(np.concatenate([outside, inside]), axis=(0, 1))
     figure = style.new_figure(9.0, 4.1 * height / width + 0.9)
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
@@ -249,12 +251,9 @@ def _joints(mech: TwoDof, poses: np.ndarray) -> jax.Array:
     return jnp.asarray(values if isinstance(mech, TwoRPR) else np.radians(values))
 
 
-def _skeletons(mech: TwoDof, poses: jax.Array, joints: jax.Array) -> np.ndarray:
-    return np.asarray(_skeleton_points(mech, poses, joints))  # (k, p, 2)
-
-
 @jax.jit
-def _skeleton_points(mech, poses, joints):
+def _skeletons(mech: TwoDof, poses: jax.Array, joints: jax.Array) -> jax.Array:
+    """Points of the skeleton at every pose. -> (k, p, 2)"""
     return jax.vmap(lambda pose, q: mech.skeleton(pose, q).points)(poses, joints)
 
 

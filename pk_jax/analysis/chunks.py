@@ -12,28 +12,29 @@ ROWS_AT_ONCE = 16  # fits the cache with some thousand nodes a row
 
 
 def forward_mode(function: Callable[[jax.Array], jax.Array]) -> Callable[[jax.Array], jax.Array]:
-    """`function` (n,) -> (k,), its derivatives always taken by forward mode.
+    """`function` (n,) -> array, its derivatives of every order always taken by forward mode.
 
     For integrals of a few design variables over thousands of nodes: reverse mode would keep every
-    node in memory. `jax.grad` works as ever; it transposes the (k, n) Jacobian, not the integral.
+    node in memory. `jax.grad` works as ever; it transposes the Jacobian, not the integral.
     Under `jax.vmap` the rows run in chunks.
     """
-    value = in_chunks(function)
 
-    def twice(p):
-        y = function(p)
-        return y, y
+    def with_slopes(p):  # (..., 1 + n): the value, and its derivative in each variable
+        def twice(p):
+            y = function(p)
+            return y, y
 
-    value_and_jacobian = in_chunks(jax.jacfwd(twice, has_aux=True))
+        jacobian, y = jax.jacfwd(twice, has_aux=True)(p)
+        return jnp.concatenate([y[..., None], jacobian], axis=-1)
 
     @jax.custom_jvp
     def call(p):
-        return value(p)
+        return in_chunks(function)(p)
 
     @call.defjvp
     def call_jvp(primals, tangents):
-        jacobian, y = value_and_jacobian(*primals)
-        return y, jacobian @ tangents[0]
+        both = forward_mode(with_slopes)(*primals)
+        return both[..., 0], both[..., 1:] @ tangents[0]
 
     return call
 

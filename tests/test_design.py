@@ -1,0 +1,253 @@
+"""Design spaces, the composite index, the ascent in the box, and the optima of both mechanisms."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import pk_jax as pk
+from pk_jax.design import ascent
+from pk_jax.design.optimize import maximize
+
+RPR, RRR = pk.design_space("2-rpr"), pk.design_space("2-rrr")
+
+
+@cache
+def optimum(name, weights):
+    return pk.optimize_design(pk.design_space(name), weights)
+
+
+# --- spaces
+
+
+@pytest.mark.parametrize("space", [RPR, RRR], ids=str)
+def test_the_box_is_the_feasible_set(space):
+    boxes = np.random.default_rng(1).uniform(0, 1, (200, len(space.variables)))
+    boxes[:40] = np.round(boxes[:40])  # corners and edges
+    for box in boxes:
+        vector = space.from_box(jnp.asarray(box))
+        assert min(space.constraints(vector).values()) >= -1e-12
+        again = space.from_box(space.to_box(vector))
+        np.testing.assert_allclose(again, vector, atol=1e-12)
+
+
+def test_faces_of_the_box_are_constraints():
+    low = RRR.from_box(jnp.array([0.0, 0.3]))
+    assert abs(RRR.constraints(low)["lb - la = R"]) < 1e-12
+    assert RRR.constraints(RRR.from_box(jnp.array([0.3, 0.0])))["v = 0"] == 0
+    assert abs(RRR.constraints(RRR.from_box(jnp.array([1.0, 0.3])))["l_min = 5 R"]) < 1e-12
+    np.testing.assert_allclose(RRR.from_box(jnp.zeros(2)), [1, 0])
+    assert RPR.constraints(RPR.from_box(jnp.ones(1)))["l_min = 3 R"] == 0
+
+
+def test_mechanisms_of_a_space_satisfy_equation_22():
+    mech = RRR.mechanism(jnp.array([2.08, np.sqrt(0.39)]))
+    np.testing.assert_allclose([mech.proximal, mech.distal, *mech.reach], [1.39, 2.69, 2.08, 4.08])
+    mech = RPR.mechanism(jnp.array([1.01]))
+    np.testing.assert_allclose([mech.l_min, mech.l_max], [1.01, 3.01])
+
+
+def test_the_gradient_passes_through_the_mechanism_at_la_equal_r():
+    """d gri / dv at v = 0 is not 0, though d la / dv is: the mechanism carries v."""
+    slope = jax.jit(jax.grad(lambda v: pk.workspace_indices(RRR.mechanism(jnp.stack([1.7, v]))).gri))(0.0)
+    assert np.isfinite(slope) and abs(slope) > 0.1
+
+
+def test_unknown_space():
+    with pytest.raises(ValueError, match="design space must be one of '2-rpr', '2-rrr', got '3-rrr'"):
+        pk.design_space("3-rrr")
+
+
+# --- composite index
+
+
+def test_composite_index_is_equation_27():
+    indices = jnp.array([0.5, 1.0, 0.3])
+    bounds = (jnp.array([0.2, 0.4, 0.1]), jnp.array([0.7, 2.4, 0.5]))
+    expected = 2 * (0.3 / 0.5) + 1 * (0.6 / 2.0) + 3 * (0.2 / 0.4)
+    assert abs(pk.composite_index(indices, bounds, (2, 1, 3)) - expected) < 1e-15
+    batch = pk.composite_index(jnp.stack([indices, bounds[1]]), bounds, (1, 1, 1))
+    np.testing.assert_allclose(batch, [0.6 + 0.3 + 0.5, 3.0])
+    found = pk.workspace_indices(pk.TwoRPR(half_base=1, l_min=2, l_max=4))
+    as_array = pk.composite_index(jnp.stack([found.gii, found.gri, found.sui]), bounds)
+    assert pk.composite_index(found, bounds) == as_array
+
+
+def test_the_normalization_is_frozen():
+    gradient = jax.grad(lambda b: pk.composite_index(jnp.ones(3), (b, jnp.full(3, 5.0)), (1, 1, 1)))(jnp.zeros(3))
+    np.testing.assert_array_equal(gradient, 0)
+
+
+@pytest.mark.parametrize(
+    "weights", [(0, 0, 0), (-1, 1, 1), (np.nan, 1, 1), (np.inf, 1, 1), (1, 1), (1, 1, 1, 1), 1, "abc", (1, "a", 1)]
+)
+def test_bad_weights(weights):
+    with pytest.raises(ValueError, match="weights") as told:
+        pk.composite_index(jnp.ones(3), (np.zeros(3), np.ones(3)), weights)
+    assert "\n" not in str(told.value)
+    with pytest.raises(ValueError, match="weights"):
+        pk.optimize_design(RPR, weights)
+
+
+@pytest.mark.parametrize(
+    "bounds", [None, 3, (np.ones(3), np.ones(3)), (np.ones(3), np.zeros(3)), (np.zeros(2), np.ones(2)), ([0, 0, np.nan], [1, 1, 1])]
+)
+def test_bad_bounds(bounds):
+    with pytest.raises(ValueError, match="bounds"):
+        pk.composite_index(jnp.ones(3), bounds)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"starts": 0}, "starts must be an integer"),
+        ({"starts": -3}, "starts must be an integer"),
+        ({"starts": [[0.9]]}, "starts lies outside the 2-rpr designs, beyond l_min = R"),
+        ({"starts": [[3.1]]}, "beyond l_min = 3 R"),
+        ({"starts": [[1.5, 0.1]]}, "starts must have shape"),
+        ({"starts": [[np.nan]]}, "starts must be finite"),
+        ({"steps": 0}, "steps must be an integer"),
+        ({"steps": 10**24}, "steps must be an integer"),
+        ({"steps": 2.5}, "steps must be an integer"),
+        ({"tolerance": 0}, "tolerance"),
+        ({"tolerance": "x"}, "tolerance"),
+        ({"bounds": (1, 2)}, "bounds"),
+    ],
+)
+def test_bad_options(options, words):
+    with pytest.raises(ValueError) as told:
+        pk.optimize_design(RPR, **({"bounds": (np.zeros(3), np.ones(3))} | options))
+    assert words in str(told.value) and "\n" not in str(told.value)
+
+
+def test_space_must_be_a_space():
+    with pytest.raises(ValueError, match=r"space must come from design_space"):
+        pk.optimize_design("2-rpr")
+
+
+# --- ascent, on functions with known maxima
+
+
+def climb(function, starts, steps=60, tolerance=1e-9):
+    evaluate = jax.value_and_grad(function)
+    step = jax.jit(jax.vmap(lambda state: ascent.advance(evaluate, tolerance, state)))
+    states = jax.vmap(ascent.begin)(jnp.asarray(starts))
+    for _ in range(steps):
+        states = step(states)
+    return states
+
+
+STARTS = np.random.default_rng(3).uniform(0, 1, (8, 3))
+
+
+def test_a_concave_quadratic_with_bounds():
+    target = jnp.array([0.3, 1.7, -0.4])  # the last two lie outside: bounds bind there
+    states = climb(lambda x: -jnp.sum(jnp.array([1.0, 30.0, 5.0]) * (x - target) ** 2), STARTS)
+    np.testing.assert_allclose(states.box, np.tile([0.3, 1.0, 0.0], (8, 1)), atol=1e-8)
+    assert np.all(states.box[:, 1] == 1) and np.all(states.box[:, 2] == 0)  # reached, not approached
+    assert np.all(states.is_done) and np.all(states.evaluations < 25)
+
+
+def test_a_curved_valley():
+    """Rosenbrock's function: neither concave nor well scaled."""
+    states = climb(
+        lambda x: -(100 * (x[1] - x[0] ** 2) ** 2 + (0.7 - x[0]) ** 2 + x[2] ** 2), STARTS, steps=150
+    )
+    np.testing.assert_allclose(states.box, np.tile([0.7, 0.49, 0.0], (8, 1)), atol=1e-5)
+
+
+def test_a_finished_start_stays_and_a_nan_is_no_step():
+    def hole(x):
+        return jnp.where(x[0] > 0.8, jnp.nan, x[0] - (x[1] - 0.5) ** 2 - (x[2] - 0.5) ** 2)
+
+    states = climb(hole, np.full((1, 3), 0.4))
+    assert np.all(np.isfinite(states.box)) and 0.7 < states.box[0, 0] <= 0.8
+    flat = climb(lambda x: 0 * jnp.sum(x), STARTS, steps=5)
+    np.testing.assert_array_equal(flat.box, STARTS)
+    assert np.all(flat.evaluations == 1)
+
+
+# --- the optima of the paper's problem, continuous and area-weighted
+
+R_OPTIMA = {  # weights: (l_min, la, objective, active), computed by three other programs
+    (1, 0, 0): (1.98232198, 1.35146183, 1, ()),
+    (0, 1, 0): (1.19238043, 1, 1, ("v = 0",)),
+    (0, 0, 1): (1, 1, 1, ("l_min = R", "v = 0")),
+    (1, 1, 0): (1.32694973, 1, 1.834588003, ("v = 0",)),
+    (0, 1, 1): (1.00185049, 1, 1.954222344, ("v = 0",)),
+    (1, 0, 1): (1.03898633, 1.01949317, 1.693850175, ("lb - la = R",)),
+    (1, 1, 1): (1.10068246, 1, 2.672582579, ("v = 0",)),
+}
+
+
+@pytest.mark.parametrize("weights", R_OPTIMA)
+def test_optima_of_the_2rrr(weights):
+    l_min, la, objective, active = R_OPTIMA[weights]
+    found = optimum("2-rrr", weights)
+    assert found.status == pk.Status.OK
+    assert abs(found.vector[0] - l_min) < 1e-5 and abs(found.mechanism.proximal - la) < 1e-5
+    assert abs(found.objective - objective) < 1e-8
+    assert found.active == active
+    assert found.kkt < 1e-5 and all(value >= 0 for value in found.multipliers.values())
+    assert found.history.objective[-1] == pytest.approx(found.objective, abs=1e-12)
+    assert np.all(np.diff(found.history.objective) >= 0)
+    assert len(found.history.objective) == found.evaluations < found.evaluations_in_all
+
+
+@pytest.mark.parametrize("weights", R_OPTIMA)
+def test_optima_of_the_2rpr(weights):
+    """All three indices fall with l_min."""
+    found = optimum("2-rpr", weights)
+    assert found.vector == [1.0] and found.active == ("l_min = R",)
+    assert abs(found.objective - sum(weights)) < 1e-8 and abs(found.cpi - 3) < 1e-8
+
+
+def test_multiplier_of_the_2rpr():
+    assert abs(optimum("2-rpr", (1, 1, 1)).multipliers["l_min = R"] - 2.60927310) < 1e-7
+
+
+def test_extremes_of_the_indices():
+    lower, upper = pk.index_bounds(RRR)
+    np.testing.assert_allclose(lower, [0.253247347815, 0.215713843017, 0.166155997594], rtol=1e-8)
+    np.testing.assert_allclose(upper, [0.690361746908, 2.571289817603, 0.451542036653], rtol=1e-8)
+    lower, upper = pk.index_bounds(RPR)
+    np.testing.assert_allclose(lower, [0.2272008754, 0.4295138550, 0.2376223059], rtol=1e-9)
+    np.testing.assert_allclose(upper, [0.5213190204, 0.7829910881, 0.4515420367], rtol=1e-9)
+
+
+def test_another_optimizer_finds_nothing_better():
+    bounds = pk.index_bounds(RRR)
+    value = jax.jit(
+        jax.value_and_grad(
+            lambda box: -pk.composite_index(
+                pk.workspace_indices(RRR.mechanism(RRR.from_box(box)), nodes=(10, 10)), bounds, (1, 1, 1)
+            )
+        )
+    )
+    for start in ((0.5, 0.5), (0.1, 0.8)):
+        answer = minimize(value, start, jac=True, bounds=[(0, 1)] * 2, method="L-BFGS-B")
+        assert -answer.fun < optimum("2-rrr", (1, 1, 1)).objective + 1e-6
+
+
+def test_a_given_start_and_the_step_limit():
+    found = pk.optimize_design(RRR, starts=[2.0, 0.3])
+    assert abs(found.objective - 2.672582579) < 1e-8
+    assert found.evaluations == found.evaluations_in_all <= 16
+    stopped = pk.optimize_design(RRR, starts=[2.0, 0.3], steps=3)
+    assert stopped.status == pk.Status.STEP_LIMIT and stopped.evaluations == 3
+    assert stopped.kkt > 1e-3
+
+
+def test_the_same_call_gives_the_same_bits():
+    first, second = (maximize(RRR, jnp.ones((1, 3)), starts=4)[0] for _ in range(2))
+    np.testing.assert_array_equal(first.vector, second.vector)
+
+
+def test_progress_is_reported():
+    lines = []
+    pk.optimize_design(RPR, report=lambda *line: lines.append(line))
+    assert {what for what, *_ in lines} >= {"2-rpr: searching", "2-rpr: refining"}
+    assert all(0 < done <= 100 == total and np.isfinite(best) for _, done, total, best in lines)

@@ -1,39 +1,103 @@
-"""Differentiable kinematics of parallel mechanisms in JAX."""
+"""Differentiable kinematics of parallel mechanisms in JAX.
 
-from typing import Any
+Importing this package imports nothing else: each public name is looked up in its module at its
+first use, so that `pk-jax --help` is instant, and jax configures itself only when it is needed.
+"""
 
-from pk_jax.analysis.indices import LocalIndices as LocalIndices
-from pk_jax.analysis.indices import local_indices as local_indices
-from pk_jax.analysis.workspace import IndexErrors as IndexErrors
-from pk_jax.analysis.workspace import WorkspaceIndices as WorkspaceIndices
-from pk_jax.analysis.workspace import workspace_indices as workspace_indices
-from pk_jax.design.objective import IndexBounds as IndexBounds
-from pk_jax.design.objective import composite_index as composite_index
-from pk_jax.design.optimize import DesignResult as DesignResult
-from pk_jax.design.optimize import index_bounds as index_bounds
-from pk_jax.design.optimize import optimize_design as optimize_design
-from pk_jax.design.variables import DesignSpace as DesignSpace
-from pk_jax.design.variables import design_space as design_space
-from pk_jax.kinematics.forward import ForwardKinematics as ForwardKinematics
-from pk_jax.kinematics.forward import forward_kinematics as forward_kinematics
-from pk_jax.kinematics.inverse import InverseKinematics as InverseKinematics
-from pk_jax.kinematics.inverse import inverse_kinematics as inverse_kinematics
-from pk_jax.kinematics.jacobian import joint_jacobian as joint_jacobian
-from pk_jax.kinematics.jacobian import pose_jacobian as pose_jacobian
-from pk_jax.kinematics.jacobian import velocity_jacobian as velocity_jacobian
-from pk_jax.kinematics.laws import check_mechanism as check_mechanism
-from pk_jax.mechanisms.base import LegMechanism as LegMechanism
-from pk_jax.mechanisms.base import Mechanism as Mechanism
-from pk_jax.mechanisms.base import Skeleton as Skeleton
-from pk_jax.mechanisms.catalogue import catalogued as catalogued
-from pk_jax.mechanisms.five_bar import FiveBar as FiveBar
-from pk_jax.mechanisms.two_rpr import TwoRPR as TwoRPR
-from pk_jax.precision import enable_x64 as enable_x64
-from pk_jax.status import Status as Status
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pk_jax.analysis.indices import LocalIndices as LocalIndices
+    from pk_jax.analysis.indices import local_indices as local_indices
+    from pk_jax.analysis.workspace import IndexErrors as IndexErrors
+    from pk_jax.analysis.workspace import WorkspaceIndices as WorkspaceIndices
+    from pk_jax.analysis.workspace import workspace_indices as workspace_indices
+    from pk_jax.design.objective import IndexBounds as IndexBounds
+    from pk_jax.design.objective import composite_index as composite_index
+    from pk_jax.design.optimize import DesignResult as DesignResult
+    from pk_jax.design.optimize import index_bounds as index_bounds
+    from pk_jax.design.optimize import optimize_design as optimize_design
+    from pk_jax.design.variables import DesignSpace as DesignSpace
+    from pk_jax.design.variables import design_space as design_space
+    from pk_jax.kinematics.forward import ForwardKinematics as ForwardKinematics
+    from pk_jax.kinematics.forward import forward_kinematics as forward_kinematics
+    from pk_jax.kinematics.inverse import InverseKinematics as InverseKinematics
+    from pk_jax.kinematics.inverse import inverse_kinematics as inverse_kinematics
+    from pk_jax.kinematics.jacobian import joint_jacobian as joint_jacobian
+    from pk_jax.kinematics.jacobian import pose_jacobian as pose_jacobian
+    from pk_jax.kinematics.jacobian import velocity_jacobian as velocity_jacobian
+    from pk_jax.kinematics.laws import check_mechanism as check_mechanism
+    from pk_jax.mechanisms.base import LegMechanism as LegMechanism
+    from pk_jax.mechanisms.base import Mechanism as Mechanism
+    from pk_jax.mechanisms.base import Skeleton as Skeleton
+    from pk_jax.mechanisms.catalogue import catalogued as catalogued
+    from pk_jax.mechanisms.five_bar import FiveBar as FiveBar
+    from pk_jax.mechanisms.two_rpr import TwoRPR as TwoRPR
+    from pk_jax.precision import enable_x64 as enable_x64
+    from pk_jax.status import Status as Status
+    from pk_jax.viz.skeleton import draw as draw
+
+_NAMES = {
+    "pk_jax.analysis.indices": (
+        "LocalIndices",
+        "local_indices",
+    ),
+    "pk_jax.analysis.workspace": (
+        "IndexErrors",
+        "WorkspaceIndices",
+        "workspace_indices",
+    ),
+    "pk_jax.design.objective": (
+        "IndexBounds",
+        "composite_index",
+    ),
+    "pk_jax.design.optimize": (
+        "DesignResult",
+        "index_bounds",
+        "optimize_design",
+    ),
+    "pk_jax.design.variables": (
+        "DesignSpace",
+        "design_space",
+    ),
+    "pk_jax.kinematics.forward": (
+        "ForwardKinematics",
+        "forward_kinematics",
+    ),
+    "pk_jax.kinematics.inverse": (
+        "InverseKinematics",
+        "inverse_kinematics",
+    ),
+    "pk_jax.kinematics.jacobian": (
+        "joint_jacobian",
+        "pose_jacobian",
+        "velocity_jacobian",
+    ),
+    "pk_jax.kinematics.laws": ("check_mechanism",),
+    "pk_jax.mechanisms.base": (
+        "LegMechanism",
+        "Mechanism",
+        "Skeleton",
+    ),
+    "pk_jax.mechanisms.catalogue": ("catalogued",),
+    "pk_jax.mechanisms.five_bar": ("FiveBar",),
+    "pk_jax.mechanisms.two_rpr": ("TwoRPR",),
+    "pk_jax.precision": ("enable_x64",),
+    "pk_jax.status": ("Status",),
+    "pk_jax.viz.skeleton": ("draw",),
+}
+_HOME = {name: module for module, names in _NAMES.items() for name in names}
+__all__ = sorted(_HOME)
 
 
-def draw(mech: Mechanism, pose: Any, joints: Any, ax: Any = None, **line: Any) -> Any:
-    """Draw a mechanism from its skeleton; see `pk_jax.viz.skeleton.draw`. Imports matplotlib."""
-    from pk_jax.viz.skeleton import draw
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'pk_jax' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
 
-    return draw(mech, pose, joints, ax, **line)
+
+def __dir__() -> list[str]:
+    return __all__

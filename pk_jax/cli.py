@@ -123,19 +123,24 @@ def _list(options: argparse.Namespace) -> int:
 
 def _begin():
     """What every computing command needs: float64, a compile cache of its own, a progress line."""
-    import jax
-
     from pk_jax.files.progress import Progress
     from pk_jax.precision import enable_x64
 
     enable_x64()
+    _compile_cache()
+    return Progress()
+
+
+def _compile_cache() -> None:
+    """Keep compiled functions between runs, where only the user can write: a cache is code."""
+    import jax
+
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pk_jax"
     with contextlib.suppress(OSError, RuntimeError):
         cache.mkdir(mode=0o700, parents=True, exist_ok=True)
         if (state := cache.stat()).st_uid == os.getuid() and not state.st_mode & 0o077:
             jax.config.update("jax_compilation_cache_dir", str(cache))
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
-    return Progress()
 
 
 # --- the command line
@@ -159,7 +164,9 @@ def _parser() -> argparse.ArgumentParser:
         sub.set_defaults(run=run)
         return sub
 
-    sub = command("reproduce", _reproduce, "Nam, Lee and Park 2006: both tables, Figs. 1-7, and better optima")
+    sub = command(
+        "reproduce", _reproduce, "Nam, Lee and Park 2006: both tables, Figs. 1-7, and better optima"
+    )
     sub.add_argument("--out", default="runs/nam2006", metavar="DIR", help="run folder (default: %(default)s)")
 
     sub = command("workspace", _workspace, "GII, GRI and SUI of a 2-RPR or 2-RRR")

@@ -40,13 +40,13 @@ def test_batches_of_every_size_equal_a_loop():
 
 def test_nested_batches():
     grid = ROWS[:12].reshape(3, 4, 2)
-    np.testing.assert_allclose(
-        jax.vmap(jax.vmap(wrapped))(grid), jax.vmap(jax.vmap(plain))(grid), rtol=1e-14
-    )
+    np.testing.assert_allclose(jax.vmap(jax.vmap(wrapped))(grid), jax.vmap(jax.vmap(plain))(grid), rtol=1e-14)
 
 
 def test_memory_is_that_of_one_chunk():
     """2,000 rows of 40,000 nodes would take 640 MB at once; a chunk of them takes 5 MB."""
-    heavy = forward_mode(lambda p: jnp.sum(jnp.sin(jnp.arange(40_000.0) * p[0] + jnp.cumsum(p[1] * jnp.ones(40_000))))[None])
+    heavy = forward_mode(
+        lambda p: jnp.sum(jnp.sin(jnp.arange(40_000.0) * p[0] + jnp.cumsum(p[1] * jnp.ones(40_000))))[None]
+    )
     compiled = jax.jit(jax.vmap(heavy)).lower(jnp.ones((2000, 2))).compile()
     assert compiled.memory_analysis().temp_size_in_bytes < 64e6

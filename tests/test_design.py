@@ -77,12 +77,15 @@ def test_composite_index_is_equation_27():
 
 
 def test_the_normalization_is_frozen():
-    gradient = jax.grad(lambda b: pk.composite_index(jnp.ones(3), (b, jnp.full(3, 5.0)), (1, 1, 1)))(jnp.zeros(3))
+    gradient = jax.grad(lambda b: pk.composite_index(jnp.ones(3), (b, jnp.full(3, 5.0)), (1, 1, 1)))(
+        jnp.zeros(3)
+    )
     np.testing.assert_array_equal(gradient, 0)
 
 
 @pytest.mark.parametrize(
-    "weights", [(0, 0, 0), (-1, 1, 1), (np.nan, 1, 1), (np.inf, 1, 1), (1, 1), (1, 1, 1, 1), 1, "abc", (1, "a", 1)]
+    "weights",
+    [(0, 0, 0), (-1, 1, 1), (np.nan, 1, 1), (np.inf, 1, 1), (1, 1), (1, 1, 1, 1), 1, "abc", (1, "a", 1)],
 )
 def test_bad_weights(weights):
     with pytest.raises(ValueError, match="weights") as told:
@@ -93,7 +96,15 @@ def test_bad_weights(weights):
 
 
 @pytest.mark.parametrize(
-    "bounds", [None, 3, (np.ones(3), np.ones(3)), (np.ones(3), np.zeros(3)), (np.zeros(2), np.ones(2)), ([0, 0, np.nan], [1, 1, 1])]
+    "bounds",
+    [
+        None,
+        3,
+        (np.ones(3), np.ones(3)),
+        (np.ones(3), np.zeros(3)),
+        (np.zeros(2), np.ones(2)),
+        ([0, 0, np.nan], [1, 1, 1]),
+    ],
 )
 def test_bad_bounds(bounds):
     with pytest.raises(ValueError, match="bounds"):
@@ -132,8 +143,10 @@ def test_space_must_be_a_space():
 
 
 def climb(function, starts, steps=60, tolerance=1e-9):
-    evaluate = jax.value_and_grad(function)
-    step = jax.jit(jax.vmap(lambda state: ascent.advance(evaluate, tolerance, state)))
+    def advance(state):
+        return ascent.judge(state, *jax.value_and_grad(function)(ascent.propose(state)), tolerance)
+
+    step = jax.jit(jax.vmap(advance))
     states = jax.vmap(ascent.begin)(jnp.asarray(starts))
     for _ in range(steps):
         states = step(states)
@@ -222,8 +235,10 @@ def test_another_optimizer_finds_nothing_better():
     bounds = pk.index_bounds(RRR)
     value = jax.jit(
         jax.value_and_grad(
-            lambda box: -pk.composite_index(
-                pk.workspace_indices(RRR.mechanism(RRR.from_box(box)), nodes=(10, 10)), bounds, (1, 1, 1)
+            lambda box: (
+                -pk.composite_index(
+                    pk.workspace_indices(RRR.mechanism(RRR.from_box(box)), nodes=(10, 10)), bounds, (1, 1, 1)
+                )
             )
         )
     )
@@ -249,5 +264,5 @@ def test_the_same_call_gives_the_same_bits():
 def test_progress_is_reported():
     lines = []
     pk.optimize_design(RPR, report=lambda *line: lines.append(line))
-    assert {what for what, *_ in lines} >= {"2-rpr: searching", "2-rpr: refining"}
+    assert [what for what, *_ in lines] == ["2-rpr"] * len(lines) and len(lines) > 0
     assert all(0 < done <= 100 == total and np.isfinite(best) for _, done, total, best in lines)

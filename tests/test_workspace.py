@@ -222,7 +222,9 @@ def test_two_rpr_gradients():
     for l_min in (1.3, 1.7, 2.9):
         slope = jax.jacfwd(lambda x: triple(pk.workspace_indices(two_rpr(x))))(l_min)
         h = 1e-3
-        stencil = sum(w * fine(l_min + k * h) for k, w in ((1, 45), (2, -9), (3, 1), (-1, -45), (-2, 9), (-3, -1)))
+        stencil = sum(
+            w * fine(l_min + k * h) for k, w in ((1, 45), (2, -9), (3, 1), (-1, -45), (-2, 9), (-3, -1))
+        )
         np.testing.assert_allclose(slope, stencil / (60 * h), atol=1e-10)
 
 
@@ -234,7 +236,9 @@ def test_gradient_of_a_mechanism_is_a_mechanism():
     chained = 2 * 0.5 * (gradient.proximal - gradient.distal)
     np.testing.assert_allclose(chained, slopes()(np.array([[2.0, 0.5]]))[0, 0, 1], rtol=1e-9)
     np.testing.assert_allclose(
-        gradient.reach[0] + gradient.reach[1] + gradient.distal, slopes()(np.array([[2.0, 0.5]]))[0, 0, 0], rtol=1e-9
+        gradient.reach[0] + gradient.reach[1] + gradient.distal,
+        slopes()(np.array([[2.0, 0.5]]))[0, 0, 0],
+        rtol=1e-9,
     )
 
 
@@ -295,7 +299,9 @@ def test_a_refused_design_under_vmap_is_told_and_hurts_no_other():
     assert poisoned.status[1] == pk.Status.BAD_INPUT and np.all(np.isfinite(poisoned.gii[others]))
 
 
-@pytest.mark.parametrize("nodes", [(0, 8), (8, -1), (1, 8), (8,), (8, 8, 8), 8, (8.0, 8), ("8", 8), (True, 8), (8, 10**9)])
+@pytest.mark.parametrize(
+    "nodes", [(0, 8), (8, -1), (1, 8), (8,), (8, 8, 8), 8, (8.0, 8), ("8", 8), (True, 8), (8, 10**9)]
+)
 def test_bad_node_counts(nodes):
     for rule in ("gauss", "midpoint", "paper"):
         with pytest.raises(ValueError, match="nodes"):

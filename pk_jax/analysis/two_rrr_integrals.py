@@ -82,7 +82,13 @@ def _densities(links: _Links, a, phi1, away2) -> tuple[jax.Array, jax.Array, jax
     the distal links at the end point, Gamma that between the legs, and alpha_i that between leg and
     distal link: gamma = Gamma + alpha1 + alpha2.
     """
-    la, lb, l_min, l_max, sin_limit, cos_limit = links.la, links.lb, links.l_min, links.l_max, *links.half_limit
+    la, lb, l_min, l_max, sin_limit, cos_limit = (
+        links.la,
+        links.lb,
+        links.l_min,
+        links.l_max,
+        *links.half_limit,
+    )
     sin_a, cos_a = jnp.sin(a / 2), jnp.cos(a / 2)
     sin_p, cos_p = jnp.sin(phi1 / 2), jnp.cos(phi1 / 2)  # p, q: the halves of phi1, phi2
     sin_w, cos_w = jnp.sin(away2 / 2), jnp.cos(away2 / 2)
@@ -95,7 +101,9 @@ def _densities(links: _Links, a, phi1, away2) -> tuple[jax.Array, jax.Array, jax
     l1, l2 = jnp.sqrt(p1**2 + q1**2), jnp.sqrt(p2**2 + q2**2)
     # distances of the leg lengths from their limits: differences of cosines as products of sines
     below_max1 = 4 * la * lb * sin_p**2 / (l_max + l1)
-    above_min1 = 4 * la * lb * (sin_a * cos_w + cos_a * sin_w) * (sin_limit * cos_p + cos_limit * sin_p) / (l1 + l_min)
+    above_min1 = (
+        4 * la * lb * (sin_a * cos_w + cos_a * sin_w) * (sin_limit * cos_p + cos_limit * sin_p) / (l1 + l_min)
+    )
     above_min2 = 4 * la * lb * sin_w * (sin_limit * cos_q + cos_limit * sin_q) / (l2 + l_min)
     # 16 y^2 = ((l1 + l2)^2 - 4) (4 - (l1 - l2)^2)
     tall = (l1 + l2 + 2) * (above_min1 + above_min2 + 2 * (l_min - 1))

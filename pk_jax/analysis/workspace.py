@@ -127,11 +127,15 @@ def _slacks(mech: Mechanism) -> list[tuple[str, jax.Array]]:
 def _require_admissible(mech: Mechanism) -> None:
     for what, slack in _slacks(mech):
         if not bool(jnp.all(slack >= 0)):
-            raise ValueError(f"workspace_indices needs {what}; got {mech!r} with l_min, l_max = {_text(mech)}")
+            raise ValueError(
+                f"workspace_indices needs {what}; got {mech!r} with l_min, l_max = {_text(mech)}"
+            )
 
 
 def _text(mech: Mechanism) -> str:
-    return ", ".join(f"{float(limit):.9g}" for limit in _stroke(mech)) if mech.half_base.ndim == 0 else "a batch"
+    return (
+        ", ".join(f"{float(limit):.9g}" for limit in _stroke(mech)) if mech.half_base.ndim == 0 else "a batch"
+    )
 
 
 def _some_design(mech: Mechanism) -> Mechanism:

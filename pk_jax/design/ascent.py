@@ -1,12 +1,11 @@
 """Gradient ascent in the unit box: optax's L-BFGS on the free variables, projection on the bounds.
 
-One evaluation of value and gradient a step, so a step can be counted, vmapped over starts and
-scanned in jitted chunks. Bounds are reached exactly, which a sigmoid bijection never does.
+One evaluation of value and gradient a step: `propose` a point, evaluate it, `judge` it. Both are
+for one start and vmapped over many. Bounds are reached exactly, which a sigmoid bijection never does.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -36,9 +35,6 @@ class Ascent(NamedTuple):
     is_done: jax.Array  # () bool
 
 
-Evaluate = Callable[[jax.Array], tuple[jax.Array, jax.Array]]  # box -> value, gradient
-
-
 def begin(box: jax.Array) -> Ascent:
     """The state before the first evaluation, which is of the start itself."""
     zero = jnp.zeros((), box.dtype)
@@ -57,10 +53,17 @@ def begin(box: jax.Array) -> Ascent:
     )
 
 
-def advance(evaluate: Evaluate, tolerance: float, state: Ascent) -> Ascent:
-    """One trial: accept it and aim anew, or shorten the step. A finished start stays as it is."""
-    trial = jnp.clip(state.box + state.length * state.toward, 0, 1)
-    value, gradient = evaluate(trial)
+def propose(state: Ascent) -> jax.Array:
+    """The point to evaluate next. -> (n,)"""
+    return jnp.clip(state.box + state.length * state.toward, 0, 1)
+
+
+def judge(state: Ascent, value: jax.Array, gradient: jax.Array, tolerance: float) -> Ascent:
+    """Accept the proposed point, whose value and gradient these are, and aim anew; or cut the step.
+
+    A finished start stays as it is.
+    """
+    trial = propose(state)
     promised = state.gradient @ (trial - state.box)
     # NaN compares False: a trial outside the function's domain is one more refusal
     accept = (value >= state.value + SUFFICIENT * promised) & jnp.all(jnp.isfinite(gradient))

@@ -61,5 +61,7 @@ def require_bounds(bounds: Any) -> IndexBounds:
         for bound in found:
             checks.is_finite("bounds", bound)
         if not np.all(np.asarray(found.lower) < np.asarray(found.upper)):
-            raise ValueError(f"bounds must have lower < upper, got {found.lower.tolist()}, {found.upper.tolist()}")
+            raise ValueError(
+                f"bounds must have lower < upper, got {found.lower.tolist()}, {found.upper.tolist()}"
+            )
     return found

@@ -25,16 +25,14 @@ from pk_jax.design.variables import DesignSpace
 from pk_jax.mechanisms.base import Mechanism
 from pk_jax.status import Status
 
-STEPS_AT_ONCE = 5  # of a jitted chunk; the host reports in between
-LANES = 8  # starts of a jitted block
-COARSE = (10, 10)  # Gauss nodes while many starts search
+BLOCK = 8  # designs evaluated by one call of the compiled function
 ACTIVE_BELOW = 1e-9  # slack of a constraint that holds with equality
 
 Report = Callable[[str, int, int, float], None]  # what, steps done, steps allowed, best value
 
 
 class History(NamedTuple):
-    """One entry a step of the winning start's last ascent."""
+    """One entry a step of the winning start."""
 
     vector: np.ndarray  # (steps, n) best design so far
     objective: np.ndarray  # (steps,)
@@ -55,7 +53,7 @@ class DesignResult(NamedTuple):
     kkt: float  # greatest entry of grad(objective) + sum multiplier grad(slack)
     history: History
     evaluations: int  # of value and gradient, along the winning start
-    evaluations_in_all: int  # over all starts, coarse ones included
+    evaluations_in_all: int  # over all starts
     status: Status  # OK, STEP_LIMIT, or STALLED where the KKT residual stayed large
 
 
@@ -73,11 +71,10 @@ def optimize_design(
 
     weights:    (3,) of GII, GRI, SUI, each >= 0, not all zero
     bounds:     normalization (lower (3,), upper (3,)); default: `index_bounds(space)`, frozen
-    starts:     how many starts, spread evenly over the space and searched with a coarse rule
-                before the best is refined; or design vectors (n,), (k, n), refined all
+    starts:     how many, spread evenly over the space; or design vectors (n,) or (k, n)
     steps:      evaluations of value and gradient that each start may take
     tolerance:  of the projected gradient in the unit box; default 1e-7 (float32: 1e-3)
-    report:     called between chunks of steps with (what, steps done, steps allowed, best value)
+    report:     called after every step with (what, steps done, steps allowed, best value)
     """
     if not isinstance(space, DesignSpace):
         raise ValueError(f"space must come from design_space(...), got {type(space).__name__}")
@@ -138,7 +135,7 @@ class Maximum(NamedTuple):
 
 def maximize(
     space: DesignSpace,
-    slopes: jax.Array,
+    slopes: Any,
     *,
     starts: Any = 12,
     steps: int = 100,
@@ -146,94 +143,95 @@ def maximize(
     report: Report | None = None,
 ) -> list[Maximum]:
     """Maximize slopes[i] @ (gii, gri, sui) for every row of slopes (k, 3), all in one batch."""
-    tolerance = _tolerance(tolerance)
-    slopes = np.asarray(slopes)
-    size = len(space.variables)
+    slopes, size = np.asarray(slopes), len(space.variables)
     if isinstance(starts, int | np.integer):
-        count = checks.is_count("starts", starts, most=10_000)
-        boxes = np.broadcast_to(_even(count, size), (len(slopes), count, size))
-        searched = _climb(space, COARSE, slopes, boxes, steps, 1e-4, report, "searching")[-1]
-        spent = searched.evaluations.sum(axis=1)
-        best = np.nanargmax(searched.value, axis=1)
-        boxes = np.take_along_axis(searched.box, best[:, None, None], axis=1)
+        boxes = _even(checks.is_count("starts", starts, most=10_000), size)
     else:
         vectors = jnp.atleast_2d(space.require("starts", starts))
         boxes = np.asarray(jax.vmap(space.to_box)(vectors))
-        boxes = np.broadcast_to(boxes, (len(slopes), *boxes.shape))
-        spent = np.zeros(len(slopes), int)
+    count = len(boxes)
+    trail = _climb(
+        space, np.repeat(slopes, count, axis=0), np.tile(boxes, (len(slopes), 1)), steps, tolerance, report
+    )
 
-    trail = _climb(space, None, slopes, boxes, steps, tolerance, report, "refining")
     answers = []
-    for i, j in enumerate(np.nanargmax(trail[-1].value, axis=1)):
-        own = int(trail[-1].evaluations[i, j])
-        path = [jax.tree.map(lambda x, i=i, j=j: x[i, j], state) for state in trail[:own]]
-        box, gradient = np.array([p.box for p in path]), np.array([p.gradient for p in path])
-        vectors = np.asarray(jax.vmap(space.from_box)(jnp.asarray(box)))
-        history = History(vectors, np.array([p.value for p in path]), ascent.stationarity(box, gradient))
-        in_all = int(spent[i] + trail[-1].evaluations[i].sum())
-        answers.append(Maximum(vectors[-1], history, own, in_all, bool(trail[-1].is_done[i, j])))
+    final = trail[-1]
+    for i in range(len(slopes)):
+        lanes = slice(i * count, (i + 1) * count)
+        best = i * count + int(np.nanargmax(final.value[lanes]))
+        own = int(final.evaluations[best])
+        box = np.array([state.box[best] for state in trail[:own]])
+        gradient = np.array([state.gradient[best] for state in trail[:own]])
+        history = History(
+            np.asarray(_from_boxes(space, box)),
+            np.array([state.value[best] for state in trail[:own]]),
+            ascent.stationarity(box, gradient),
+        )
+        in_all = int(final.evaluations[lanes].sum())
+        answers.append(Maximum(history.vector[-1], history, own, in_all, bool(final.is_done[best])))
     return answers
 
 
-def _climb(space, nodes, slopes, boxes, steps, tolerance, report, what) -> list[ascent.Ascent]:
-    """Ascend from boxes (k, s, n) with slopes (k, 3). -> the states (k, s) after every step, NumPy
-
-    Lanes go through one compiled block at a time, so that any number of them compiles once.
-    """
-    lanes = boxes.shape[0] * boxes.shape[1]
-    fill = -lanes % LANES
-    flat_boxes = np.concatenate([boxes.reshape(lanes, -1), np.tile(boxes[-1, -1], (fill, 1))])
-    flat_slopes = np.repeat(slopes, boxes.shape[1], axis=0)
-    flat_slopes = np.concatenate([flat_slopes, np.tile(slopes[-1], (fill, 1))])
-    blocks = [slice(i, i + LANES) for i in range(0, lanes + fill, LANES)]
-    states = [jax.vmap(ascent.begin)(jnp.asarray(flat_boxes[block])) for block in blocks]
+def _climb(space, slopes, boxes, steps, tolerance, report) -> list[ascent.Ascent]:
+    """Ascend from boxes (lanes, n) with slopes (lanes, 3). -> the states after every step"""
+    states = jax.vmap(ascent.begin)(jnp.asarray(boxes))
     trail = []
-    for done in range(0, steps, STEPS_AT_ONCE):
-        parts = []
-        for i, block in enumerate(blocks):
-            states[i], part = _chunk(space, nodes, tolerance, jnp.asarray(flat_slopes[block]), states[i])
-            parts.append(jax.device_get(part))
-        whole = jax.tree.map(
-            lambda *x: np.concatenate(x, 1)[:, :lanes].reshape(STEPS_AT_ONCE, *boxes.shape[:2], *x[0].shape[2:]),
-            *parts,
-        )
-        trail += [jax.tree.map(lambda x, step=step: x[step], whole) for step in range(STEPS_AT_ONCE)]
+    for done in range(1, steps + 1):
+        vectors, chain = _propose(space, states)
+        indices, gradients = indices_and_slopes(space, vectors)
+        value = np.einsum("li,li->l", slopes, indices)
+        gradient = np.einsum("li,lij,ljk->lk", slopes, gradients, np.asarray(chain))
+        states = _judge(states, value, gradient, _tolerance(tolerance))
+        trail.append(jax.device_get(states._replace(memory=None)))
         if report is not None:
-            report(f"{space.name}: {what}", done + STEPS_AT_ONCE, steps, float(np.nanmax(trail[-1].value)))
+            report(space.name, done, steps, float(np.nanmax(trail[-1].value)))
         if trail[-1].is_done.all():
             break
-    return trail[:steps]
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def _chunk(space, nodes, tolerance, slopes, states):
-    def evaluator(slope):
-        return jax.value_and_grad(lambda box: slope @ _values(space, nodes)(space.from_box(box)))
-
-    step = jax.vmap(lambda slope, state: ascent.advance(evaluator(slope), tolerance, state))
-
-    def scanned(states, _):
-        states = step(slopes, states)
-        return states, states._replace(memory=None)
-
-    return jax.lax.scan(scanned, states, length=STEPS_AT_ONCE)
-
-
-@functools.lru_cache
-def _values(space: DesignSpace, nodes: tuple[int, int] | None):
-    """vector -> (gii, gri, sui)"""
-    return lambda vector: index_vector(workspace_indices(space.mechanism(vector), nodes=nodes))
+    return trail
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _values_and_slopes(space: DesignSpace, vector: jax.Array):
-    """(gii, gri, sui) of a design, and their Jacobian (3, n)."""
-    return _values(space, None)(vector), jax.jacfwd(_values(space, None))(vector)
+def _propose(space, states):
+    """Design vectors to evaluate (lanes, n), and their derivatives in the box (lanes, n, n)."""
+    boxes = jax.vmap(ascent.propose)(states)
+    return jax.vmap(space.from_box)(boxes), jax.vmap(jax.jacfwd(space.from_box))(boxes)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _judge(states, value, gradient, tolerance):
+    return jax.vmap(lambda *lane: ascent.judge(*lane, tolerance))(states, value, gradient)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _from_boxes(space, boxes):
+    return jax.vmap(space.from_box)(boxes)
+
+
+def indices_and_slopes(space: DesignSpace, vectors: Any) -> tuple[np.ndarray, np.ndarray]:
+    """(gii, gri, sui) of designs (k, n) and their Jacobians. -> (k, 3), (k, 3, n)
+
+    Any number of designs goes through one compiled block, so that nothing compiles twice.
+    """
+    vectors = np.asarray(vectors)
+    filled = np.concatenate([vectors, np.tile(vectors[-1], (-len(vectors) % BLOCK, 1))])
+    parts = [_block(space, filled[i : i + BLOCK]) for i in range(0, len(filled), BLOCK)]
+    indices, slopes = (np.concatenate(part)[: len(vectors)] for part in zip(*parts, strict=True))
+    return indices, slopes
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _block(space, vectors):
+    def twice(vector):
+        indices = index_vector(workspace_indices(space.mechanism(vector)))
+        return indices, indices
+
+    slopes, indices = jax.vmap(jax.jacfwd(twice, has_aux=True))(vectors)
+    return indices, slopes
 
 
 def _optimality(space: DesignSpace, vector: jax.Array, slopes: jax.Array):
     """Active constraints, their multipliers and the KKT residual, in the space's own variables."""
-    gradient = np.asarray(slopes @ _values_and_slopes(space, vector)[1])
+    gradient = np.asarray(slopes) @ indices_and_slopes(space, vector[None])[1][0]
     slack = {name: float(value) for name, value in space.constraints(vector).items()}
     slopes_of = jax.jacobian(space.constraints)(vector)
     active: list[str] = []

@@ -49,13 +49,17 @@ class DesignSpace(abc.ABC):
         count = len(self.variables)
         if array.ndim not in (1, 2) or array.shape[-1] != count:
             wanted = ", ".join(self.variables)
-            raise ValueError(f"{name} must have shape ({count},) or (batch, {count}) = ({wanted}), got {array.shape}")
+            raise ValueError(
+                f"{name} must have shape ({count},) or (batch, {count}) = ({wanted}), got {array.shape}"
+            )
         checks.is_finite(name, array)
         roundoff = 1e3 * jnp.finfo(array.dtype).eps
         for row in np.atleast_2d(np.asarray(array)):
             for what, slack in self.constraints(row).items():
                 if slack < -roundoff:
-                    raise ValueError(f"{name} lies outside the {self.name} designs, beyond {what}: {row.tolist()}")
+                    raise ValueError(
+                        f"{name} lies outside the {self.name} designs, beyond {what}: {row.tolist()}"
+                    )
         return array
 
     def __repr__(self) -> str:

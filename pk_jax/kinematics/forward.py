@@ -68,9 +68,7 @@ def _one(mech: Mechanism, joints: jax.Array, guess: jax.Array | None = None) -> 
     joints = jnp.where(is_given, joints, home_joints)  # lost rows work at home and are masked after
 
     fixed, q = lax.stop_gradient((mech, joints))
-    solution = newton.solve(
-        lambda x: fixed.linearize(x, q), retract, start, scale=pose_scale(fixed, start)
-    )
+    solution = newton.solve(lambda x: fixed.linearize(x, q), retract, start, scale=pose_scale(fixed, start))
     found = solution.point
     jacobian = scaled_jacobians(fixed, found, q).pose
     sigma = jnp.linalg.svd(jacobian, compute_uv=False)[-1]

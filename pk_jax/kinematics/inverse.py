@@ -87,9 +87,7 @@ def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = No
 
     is_ok = status == Status.OK
     joints = joints_at(jnp.where(is_ok, pose, home_pose))  # what is differentiated never sees a limit
-    return InverseKinematics(
-        jnp.where(is_ok, joints, jnp.nan), status, jnp.where(is_given, found, jnp.nan)
-    )
+    return InverseKinematics(jnp.where(is_ok, joints, jnp.nan), status, jnp.where(is_given, found, jnp.nan))
 
 
 def _by_newton(mech: Mechanism, pose: jax.Array) -> jax.Array:

@@ -69,10 +69,14 @@ def _check_contract(mech: Mechanism, name: str) -> None:
         raise ValueError(f"{name}.residual must have shape (c,) with c >= n = {n}, got {value.shape}")
     for units, count, attribute in ((mech.joint_units, m, "joint_units"), (mech.pose_units, n, "pose_units")):
         if units is not None and (len(units) != count or set(units) - {0, 1}):
-            raise ValueError(f"{name}.{attribute} must be {count} numbers, 1 = length and 0 = angle, got {units}")
+            raise ValueError(
+                f"{name}.{attribute} must be {count} numbers, 1 = length and 0 = angle, got {units}"
+            )
     f, a = mech.linearize(pose, joints)
     if f.shape != (c,) or a.shape != (c, n):
-        raise ValueError(f"{name}.linearize must give shapes {(c,)} and {(c, n)}, got {f.shape} and {a.shape}")
+        raise ValueError(
+            f"{name}.linearize must give shapes {(c,)} and {(c, n)}, got {f.shape} and {a.shape}"
+        )
     if not (mech.length().shape == () and mech.length() > 0):
         raise ValueError(f"{name}.length must be one positive number, got {mech.length()}")
     margins = mech.margins(pose, joints)

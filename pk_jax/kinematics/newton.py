@@ -110,9 +110,7 @@ def implicit(
         return jnp.linalg.solve(jax.jacobian(linear_map)(jnp.zeros_like(rhs)), rhs)
 
     dtype = jax.tree.leaves(point)[0].dtype
-    increment = lax.custom_root(
-        equation, jnp.zeros(size, dtype), lambda _, guess: guess, dense_solve
-    )
+    increment = lax.custom_root(equation, jnp.zeros(size, dtype), lambda _, guess: guess, dense_solve)
     return retract(point, increment)
 
 

@@ -89,7 +89,9 @@ def _interchanged() -> tuple[Misprint, ...]:
             (*TABLE_2.lengths, *INDICES), TABLE_2.rows[here], TABLE_2.rows[there], strict=True
         ):
             if (there, column) == (second, "lb"):
-                found.append(Misprint("Table 2, interchanged rows", 2, here, column, "2.0", f"{_SWAP}; {_LINKS}"))
+                found.append(
+                    Misprint("Table 2, interchanged rows", 2, here, column, "2.0", f"{_SWAP}; {_LINKS}")
+                )
             elif float(cell) != float(other):
                 found.append(Misprint("Table 2, interchanged rows", 2, here, column, other, _SWAP))
     return tuple(found)

@@ -8,12 +8,10 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from pk_jax.analysis.workspace import workspace_indices
 from pk_jax.design.objective import composite_index, index_vector
+from pk_jax.design.optimize import indices_and_slopes
 from pk_jax.design.variables import design_space
 from pk_jax.files.run_folder import RunFolder, run_folder
 from pk_jax.papers.nam2006 import Cell, Reproduction, reproduce
@@ -47,13 +45,19 @@ def as_text(found: Reproduction) -> str:
     lines = []
     for table in TABLES:
         lines += ["", f"Table {table.number}: {table.space.upper()} (lengths over R)", ""]
-        lines.append(f"{'':16}{'':7}{'printed':>11}{'paper rule':>12}{'true':>12}{'our optimum':>13}  verdict")
+        lines.append(
+            f"{'':16}{'':7}{'printed':>11}{'paper rule':>12}{'true':>12}{'our optimum':>13}  verdict"
+        )
         previous = None
         for cell in (c for c in found.cells if c.table == table.number):
             row = cell.row if cell.row != previous else ""
             previous = cell.row
             numbers = f"{_round(cell.paper):>12}{_round(cell.true):>12}{_round(cell.optimum):>13}"
-            verdict = f"MISPRINT, read {cell.verdict.split(' for ')[1].split(';')[0]}" if cell.misprint else cell.verdict
+            verdict = (
+                f"MISPRINT, read {cell.verdict.split(' for ')[1].split(';')[0]}"
+                if cell.misprint
+                else cell.verdict
+            )
             lines.append(f"{row:16}{cell.column:7}{cell.printed:>11}{numbers}  {verdict}")
     lines += ["", "Misprints:"]
     for name in dict.fromkeys(cell.misprint for cell in found.cells if cell.misprint):
@@ -69,7 +73,8 @@ def as_text(found: Reproduction) -> str:
     for space, results in found.optima.items():
         for weights, r in results.items():
             at = ", ".join(
-                f"{name} {value:.8f}" for name, value in zip(design_space(space).variables, r.vector, strict=True)
+                f"{name} {value:.8f}"
+                for name, value in zip(design_space(space).variables, r.vector, strict=True)
             )
             active = "; ".join(f"{name}: {r.multipliers[name]:.8f}" for name in r.active) or "none active"
             lines.append(
@@ -78,8 +83,8 @@ def as_text(found: Reproduction) -> str:
             )
     lines += [
         "",
-        f"{agreeing} of {len(found.cells)} cells agree with the paper's rule to 1e-5 or to the printed digit, "
-        f"{misprinted} are misprinted, {len(differing)} differ.",
+        f"{agreeing} of {len(found.cells)} cells agree with the paper's rule to 1e-5 or to the printed "
+        f"digit, {misprinted} are misprinted, {len(differing)} differ.",
     ]
     return "\n".join(lines[1:])
 
@@ -146,17 +151,17 @@ def _figures(found: Reproduction):
 
     for letter, result in (("2rpr", first), ("2rrr", second)):
         mech = result.mechanism
-        yield f"fig{4 if letter == '2rpr' else 5}_local_indices_{letter}.png", two_dof.local_index_figure(mech)
+        yield (
+            f"fig{4 if letter == '2rpr' else 5}_local_indices_{letter}.png",
+            two_dof.local_index_figure(mech),
+        )
         yield f"fig6_workspace_{letter}.png", two_dof.panoramic_figure(mech)
         yield f"fig7_actuators_{letter}.png", two_dof.actuator_figure(mech)
 
 
 def _cpi(name: str, vectors: np.ndarray, optimum) -> np.ndarray:
     """True composite index of many designs. vectors (batch, n) -> (batch,)"""
-    space = design_space(name)
-    nodes = (10, 8) if name == "2-rpr" else (10, 10)
-    index = lambda z: index_vector(workspace_indices(space.mechanism(z), nodes=nodes))
-    indices = jax.jit(jax.vmap(index))(jnp.asarray(vectors))
+    indices, _ = indices_and_slopes(design_space(name), vectors)
     return np.asarray(composite_index(indices, optimum.bounds))
 
 

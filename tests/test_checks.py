@@ -1,0 +1,178 @@
+"""Bad geometry is told at the door: one line, the field, what is allowed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pk_jax as pk
+from pk_jax import checks
+
+TWO_RPR = {"half_base": 1.0, "l_min": 1.0, "l_max": 3.0}
+FIVE_BAR = {"half_base": 1.0, "proximal": 1.0, "distal": 2.15}
+
+NOT_A_LENGTH = {
+    "NaN": np.nan,
+    "infinite": np.inf,
+    "minus infinite": -np.inf,
+    "negative": -1.0,
+    "zero": 0.0,
+    "a vector": [1.0, 2.0],
+    "a vector of one": [1.0],
+    "a matrix": np.ones((2, 2)),
+    "empty": [],
+    "ragged": [[1.0], [1.0, 2.0]],
+    "a string": "1.0",
+    "complex": 1.0 + 0.0j,
+    "a bool": True,
+    "an array of bools": np.array(True),
+    "an object": object(),
+    "None": None,
+    "a dict": {"value": 1.0},
+}
+FIELDS = [(pk.TwoRPR, TWO_RPR, name) for name in TWO_RPR] + [(pk.FiveBar, FIVE_BAR, n) for n in FIVE_BAR]
+each_field = pytest.mark.parametrize(
+    ("mechanism", "good", "field"), FIELDS, ids=[f"{m.__name__}.{name}" for m, _, name in FIELDS]
+)
+
+
+def refused(build, *words, **fields):
+    """The one-line message with which `build(**fields)` is refused."""
+    with pytest.raises(ValueError) as caught:
+        build(**fields)
+    said = str(caught.value)
+    assert "\n" not in said and len(said) < 250
+    for word in words:
+        assert word in said
+    return said
+
+
+@pytest.mark.parametrize("bad", NOT_A_LENGTH.values(), ids=NOT_A_LENGTH.keys())
+@each_field
+def test_every_length_is_checked(mechanism, good, field, bad):
+    refused(mechanism, f"{mechanism.__name__}.{field} ", **{**good, field: bad})
+
+
+@each_field
+def test_a_missing_or_unknown_field_is_named(mechanism, good, field):
+    with pytest.raises(TypeError, match=field):
+        mechanism(**{name: value for name, value in good.items() if name != field})
+    with pytest.raises(TypeError, match="lenght"):
+        mechanism(**good, lenght=1.0)
+    with pytest.raises(TypeError):
+        mechanism(*good.values())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"l_min": 3.0, "l_max": 1.0}, ("TwoRPR.l_max", "3", "1")),
+        ({"l_min": 2.0, "l_max": 2.0}, ("TwoRPR.l_max", "l_min")),
+        ({"l_min": 0.2, "l_max": 0.9}, ("TwoRPR.l_max", "half_base", "0.9")),
+        ({"half_base": 4.0}, ("TwoRPR.l_max", "half_base")),
+        ({"l_min": 0.5, "l_max": 1.0}, ("TwoRPR.l_max", "half_base")),
+    ],
+)
+def test_a_stroke_must_let_the_legs_meet(wrong, words):
+    refused(pk.TwoRPR, *words, **{**TWO_RPR, **wrong})
+
+
+@pytest.mark.parametrize(
+    "reach",
+    [
+        [2.0, 1.2],  # decreasing
+        [2.0, 2.0],  # empty
+        [1.0, 3.0],  # less than |lb - la| = 1.15
+        [1.2, 3.2],  # more than la + lb = 3.15
+        [np.nan, 3.0],
+        [1.2, np.inf],
+        [-1.2, 3.0],
+        [1.2],
+        1.2,
+        [[1.2, 3.0]],
+        [1.2, 2.0, 3.0],
+        ["1.2", "3.0"],
+        [1.2 + 0j, 3.0],
+        [True, True],
+    ],
+)
+def test_reach_lies_within_the_links(reach):
+    refused(pk.FiveBar, "FiveBar.reach", reach=reach, **FIVE_BAR)
+
+
+def test_reach_up_to_the_links_is_good():
+    mech = pk.FiveBar(**FIVE_BAR, reach=[1.15, 3.15])
+    np.testing.assert_array_equal(mech.limits(), [1.15, 3.15])
+
+
+@pytest.mark.parametrize("links", [{"proximal": 0.3, "distal": 0.6}, {"proximal": 0.5, "distal": 0.5}])
+def test_arms_too_short_to_meet_are_refused(links):
+    refused(pk.FiveBar, "FiveBar.reach", "half_base", half_base=1.0, **links)
+
+
+@pytest.mark.parametrize("slack", [0.5, -0.5, np.nan, np.inf, [0.0], "0", 0j, True])
+def test_slack_belongs_to_the_proximal_link(slack):
+    refused(pk.FiveBar, "FiveBar.slack", slack=slack, **FIVE_BAR)
+
+
+def test_a_consistent_slack_is_good():
+    mech = pk.FiveBar(half_base=2.0, proximal=2.5, distal=5.0, slack=0.5)  # 2.5 / 2 = 1 + 0.5^2
+    assert mech.slack == 0.5
+
+
+@pytest.mark.parametrize("one", [1, np.int32(1), np.float64(1), jnp.ones(()), np.array(1)])
+def test_integers_and_arrays_are_numbers(one):
+    mech = pk.TwoRPR(half_base=one, l_min=one, l_max=3 * one)
+    assert all(leaf.dtype == jnp.float64 for leaf in jax.tree.leaves(mech))
+    assert [float(leaf) for leaf in jax.tree.leaves(mech)] == [1, 1, 3]
+
+
+def test_float32_stays_float32():
+    mech = pk.FiveBar(**{name: np.float32(value) for name, value in FIVE_BAR.items()})
+    assert {leaf.dtype for leaf in jax.tree.leaves(mech)} == {jnp.dtype("float32")}
+
+
+def test_under_jit_values_pass_and_shapes_do_not():
+    build = jax.jit(lambda half_base: pk.TwoRPR(half_base=half_base, l_min=1.0, l_max=3.0))
+    assert build(-1.0).half_base == -1.0  # no value is known there
+    refused(build, "TwoRPR.half_base", "shape", half_base=jnp.ones(2))
+
+
+def test_a_mechanism_is_frozen():
+    mech = pk.TwoRPR(**TWO_RPR)
+    with pytest.raises(AttributeError, match="half_base"):
+        mech.half_base = 2.0
+
+
+def test_a_mechanism_prints_its_fields():
+    assert repr(pk.TwoRPR(**TWO_RPR)) == "TwoRPR(half_base=1.0, l_min=1.0, l_max=3.0)"
+    assert "reach=None" in repr(pk.FiveBar(**FIVE_BAR))
+
+
+class Bare(pk.TwoRPR):
+    """A subclass adds a field of any shape; it is checked like the others."""
+
+    offsets: jax.Array
+
+
+@pytest.mark.parametrize("bad", [np.nan, [1.0, np.inf], "a", None, 1j])
+def test_a_users_field_is_checked_too(bad):
+    refused(Bare, "Bare.offsets ", **TWO_RPR, offsets=bad)
+
+
+@pytest.mark.parametrize("bad", [0, -3, 1.0, 2.5, True, "3", None, np.nan, 11, 10**24])
+def test_a_count_is_a_positive_integer(bad):
+    with pytest.raises(ValueError, match=r"^nodes must be an integer from 1 to 10, got "):
+        checks.is_count("nodes", bad, most=10)
+
+
+@pytest.mark.parametrize("good", [1, 10, np.int64(3)])
+def test_a_count_comes_back_as_int(good):
+    counted = checks.is_count("nodes", good, most=10)
+    assert counted == good and type(counted) is int
+
+
+def test_a_long_value_is_cut_short():
+    with pytest.raises(ValueError) as caught:
+        checks.is_finite("lengths", np.full(1000, np.nan))
+    assert len(str(caught.value)) < 120 and "\n" not in str(caught.value)

@@ -263,7 +263,7 @@ print(f"lambda v = {multiplier * longer:.4f}")
 # %% [markdown]
 # So the loss goes with the square root of the excess of $l_a$ over $R$: at this optimum a small error of
 # the driven links costs much. The map of $\eta$ over the feasible triangle shows the steep lower edge, and,
-# in white, one ascent that starts far away. It ends at the same design.
+# in orange, one ascent that starts far away. It ends at the same design.
 
 # %%
 share, l_min = np.meshgrid(np.linspace(0, 1, 21), np.linspace(1, 5, 49))
@@ -273,14 +273,14 @@ coarse = jax.jit(jax.vmap(lambda z: pk.workspace_indices(space.mechanism(z), nod
 cloud = coarse(designs)
 surface = np.asarray(pk.composite_index(cloud, bounds)).reshape(l_min.shape)
 
-climb = pk.optimize_design(space, (1, 1, 1), bounds=bounds, starts=[4.0, 0.9])
-print("from (4, 0.9):", climb.vector, "after", climb.evaluations, "evaluations;", climb.status.name)
+climb = pk.optimize_design(space, (1, 1, 1), bounds=bounds, starts=[4.0, 0.6])
+print("from (4, 0.6):", climb.vector, "after", climb.evaluations, "evaluations;", climb.status.name)
 
 figure = Figure(figsize=(11, 4), layout="compressed")
 left, right = figure.subplots(1, 2, width_ratios=(3, 2))
 optimum = (best.vector[0], float(best.mechanism.proximal), best.cpi)
 two_dof.cpi_surface(l_min, 1 + v**2, surface, optimum, left)
-left.plot(climb.history.vector[:, 0], 1 + climb.history.vector[:, 1] ** 2, "o-", color="white", ms=4, lw=1.5)
+left.plot(climb.history.vector[:, 0], 1 + climb.history.vector[:, 1] ** 2, "o-", color="#d55e00", mec="white")
 right.semilogy(best.objective - climb.history.objective + 1e-16, "o-", label="composite index still missing")
 right.semilogy(climb.history.stationarity, "s--", label="projected gradient")
 right.set(xlabel="evaluation of value and gradient")
@@ -315,7 +315,8 @@ ax = figure.subplots()
 ax.plot(*points.T, ".", color="0.8", ms=4, label="designs")
 ax.plot(*front.T, ".", color="#0072b2", ms=6, label="efficient designs")
 ax.plot(*swept.T, "o", color="#d55e00", ms=7, mfc="none", mew=1.8, label="optima of weighted sums")
-ax.set(xlabel="GII", ylabel="GRI")
+ax.plot(*np.stack([upper, lower]).T, "--", color="#d55e00", lw=1)
+ax.set(xlabel="GII", ylabel="GRI", xlim=(0.5, 0.7), ylim=(0.7, 2.7))
 ax.legend(frameon=False)
 figure
 

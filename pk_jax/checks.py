@@ -40,7 +40,7 @@ def has_shape(name: str, value: jax.Array, shape: tuple[int | None, ...]) -> Non
         want is None or got == want for got, want in zip(value.shape, shape, strict=True)
     )
     if not fits:
-        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+        wanted = str(tuple("any" if n is None else n for n in shape)).replace("'", "")
         raise ValueError(f"{name} must have shape {wanted}, got {tuple(value.shape)}")
 
 

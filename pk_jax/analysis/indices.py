@@ -74,7 +74,7 @@ def indices_at(mech: Mechanism, pose: jax.Array, joints: jax.Array) -> tuple[jax
     isotropy, resistivity = indices_of(jacobians)
     # det J has the units of the pose over those of the joints
     power = jnp.sum(units(mech.pose_units, pose.shape[0], pose.dtype))
-    power = power - jnp.sum(units(mech.joint_units, joints.shape[0], pose.dtype))
+    power = power - pose.shape[0] * jnp.mean(units(mech.joint_units, joints.shape[0], pose.dtype))
     return isotropy, resistivity / mech.length() ** power
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from pk_jax import checks
@@ -199,8 +200,8 @@ def _two_rrr(outer: int, inner: int):
 def _midpoint(mech: Mechanism, nodes: tuple[int, int]):
     """Eq. (29): rings of equal width, the integrand at their middle, on equal sectors."""
     rings, sectors = nodes
-    theta = (jnp.arange(sectors) + 0.5) / sectors * jnp.pi - jnp.pi / 2
-    fraction = (jnp.arange(rings) + 0.5) / rings
+    theta = (np.arange(sectors) + 0.5) / sectors * np.pi - np.pi / 2
+    fraction = (np.arange(rings) + 0.5) / rings
 
     def weigh(inner, outer):
         edges = inner + jnp.arange(rings + 1) / rings * (outer - inner)
@@ -214,27 +215,30 @@ def _midpoint(mech: Mechanism, nodes: tuple[int, int]):
 def _paper(mech: Mechanism, nodes: tuple[int, int]):
     """What the printed tables were computed with; eta = sum (M^2 - m^2) mean_j I / sum (M^2 - m^2)."""
     rings, sectors = nodes
-    theta = jnp.arange(2, sectors - 1) / sectors * jnp.pi - jnp.pi / 2
-    fraction = jnp.arange(1, rings) / rings
+    theta = np.arange(2, sectors - 1) / sectors * np.pi - np.pi / 2
+    fraction = np.arange(1, rings) / rings
 
     def weigh(inner, outer):
         return jnp.broadcast_to((outer**2 - inner**2) / (rings - 1), (rings - 1,))
 
     l_min = _coordinates(mech)[0]
-    gii, gri, weight, outer = _sum_sectors(mech, theta, fraction, weigh)
-    width = l_min + 1 if isinstance(mech, TwoRPR) else jnp.max(jnp.abs(outer * jnp.sin(theta)))
+    gii, gri, weight, reach = _sum_sectors(mech, theta, fraction, weigh)
+    width = l_min + 1 if isinstance(mech, TwoRPR) else reach
     box = 2 * width * jnp.sqrt((l_min + 2) ** 2 - 1)
     return _summed(mech, gii, gri, weight / 2 * jnp.pi / sectors, box)
 
 
 def _sum_sectors(mech: Mechanism, theta, fraction, weigh):
-    """Weighted means of both indices, the total weight, and the outer radius of every sector.
+    """Weighted means of both indices, the total weight, and the greatest x of a sector's end.
 
-    Radii at `fraction` between the limits of eq. (17); lengths in R, theta from the y axis.
+    Radii at `fraction` between the limits of eq. (17); lengths in R, theta from the y axis, spread
+    symmetrically: sectors of x >= 0 are computed and those beside the y axis count twice.
     """
     l_min = _coordinates(mech)[0]
     dtype = l_min.dtype
-    theta, fraction = theta.astype(dtype), fraction.astype(dtype)
+    theta, fraction = jnp.asarray(theta, dtype), jnp.asarray(fraction, dtype)
+    half = theta[: -(-len(theta) // 2)]
+    times = jnp.where(jnp.arange(len(half)) < len(theta) // 2, 2, 1).astype(dtype)
 
     def sector(theta):
         sine, cosine = jnp.abs(jnp.sin(theta)), jnp.cos(theta)
@@ -246,9 +250,14 @@ def _sum_sectors(mech: Mechanism, theta, fraction, weigh):
         weight = weigh(inner, outer).astype(dtype)
         return weight @ isotropy, weight @ resistivity, jnp.sum(weight), outer
 
-    isotropy, resistivity, weight, outer = lax.map(sector, theta)
-    total = jnp.sum(weight)
-    return jnp.sum(isotropy) / total, jnp.sum(resistivity) / total, total, outer
+    isotropy, resistivity, weight, outer = lax.map(sector, half)
+    total = times @ weight
+    return (
+        times @ isotropy / total,
+        times @ resistivity / total,
+        total,
+        jnp.max(outer * jnp.abs(jnp.sin(half))),
+    )
 
 
 def _summed(mech: Mechanism, gii, gri, area, box):

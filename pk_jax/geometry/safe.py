@@ -13,9 +13,9 @@ import jax.numpy as jnp
 
 
 def sqrt(x: jax.Array) -> jax.Array:
-    """sqrt(x) for x > 0, else 0 with derivative 0."""
-    positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+    """sqrt(x) for x > 0, else 0 with derivative 0; NaN stays NaN."""
+    is_zero = x <= 0  # NaN compares False
+    return jnp.where(is_zero, 0, jnp.sqrt(jnp.where(is_zero, 1, x)))
 
 
 def norm(v: jax.Array) -> jax.Array:

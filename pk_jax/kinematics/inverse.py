@@ -41,7 +41,8 @@ def inverse_kinematics(
     Status: OK; UNREACHABLE: no real joints; SINGULAR: a type I singularity (a leg stretched or
     folded), where the joints exist, in `candidate`, but their rates do not; NONFINITE: NaN or
     infinity in the pose. Without a closed form the joints come from Newton, started at home
-    (STALLED where that ends elsewhere). The derivative of a row that is not OK is zero.
+    (STALLED where that ends elsewhere). BAD_INPUT: a traced branch that holds no signs.
+    The derivative of a row that is not OK is zero.
     """
     home_pose, home_joints = jax.eval_shape(mech.home)
     pose = rows_of("pose", pose, home_pose)
@@ -68,6 +69,8 @@ def _solve(mech, pose_and_branch, free, are_batched):
 def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = None) -> InverseKinematics:
     home_pose, home_joints = mech.home()
     is_given = all_finite(pose)
+    is_mode = True if branch is None else jnp.all(jnp.abs(branch) == 1)
+    is_mode = True if branch is None else jnp.all(jnp.abs(branch) == 1)
     pose = jnp.where(is_given, pose, home_pose)  # lost rows work on the home pose and are masked after
     if hasattr(mech, "inverse"):
         joints_at = lambda pose: mech.inverse(pose, branch, free=free)
@@ -83,7 +86,8 @@ def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = No
     sigma = jnp.linalg.svd(jacobians.joints, compute_uv=False)[-1]
     status = jnp.where(sigma < SINGULAR_BELOW, Status.SINGULAR, Status.OK)
     status = jnp.where(is_real, status, failed)
-    status = jnp.where(is_given, status, Status.NONFINITE).astype(jnp.int32)
+    status = jnp.where(is_given, status, Status.NONFINITE)
+    status = jnp.where(is_mode, status, Status.BAD_INPUT).astype(jnp.int32)
 
     is_ok = status == Status.OK
     joints = joints_at(jnp.where(is_ok, pose, home_pose))  # what is differentiated never sees a limit

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -62,8 +62,9 @@ def check_mechanism(mech: Mechanism) -> LawReport:
 
 
 def _check_contract(mech: Mechanism, name: str) -> None:
-    pose, joints = mech.home()
-    value = mech.residual(pose, joints)
+    pose, joints = _arrays(f"{name}.home", *mech.home())
+    (value,) = _arrays(f"{name}.residual", mech.residual(pose, joints))
+    _arrays(f"{name}.length", mech.length())
     n, m, c = pose.shape[0], joints.shape[0], value.shape[0] if value.ndim else 0
     if value.ndim != 1 or c < n:
         raise ValueError(f"{name}.residual must have shape (c,) with c >= n = {n}, got {value.shape}")
@@ -99,6 +100,13 @@ def _check_contract(mech: Mechanism, name: str) -> None:
             )
 
 
+def _arrays(name: str, *values: Any) -> tuple[Any, ...]:
+    if not all(isinstance(value, jax.Array | np.ndarray) for value in values):
+        kinds = " and ".join(type(value).__name__ for value in values)
+        raise ValueError(f"{name} must be made of jax arrays, got {kinds}")
+    return values
+
+
 def _laws(mech: Mechanism):
     """Yield (law, error, tolerance); the errors are dimensionless."""
     eps = float(jnp.finfo(mech.length().dtype).eps)
@@ -117,22 +125,31 @@ def _laws(mech: Mechanism):
         "velocities: A x' + B q' = 0": exact,
         "the derivatives of FK and IK are inverses": exact,
         "power balance": exact,
+        "dF/d(geometry) against central differences": differences,
+        "geometry: dF + B dq = 0": exact,
     }
     for name, error in _errors(mech).items():
         yield name, error, tolerances.get(name, 0.0)  # the others are counts: none is allowed
 
 
 def _errors(mech: Mechanism) -> dict[str, jax.Array]:
-    names = []
+    pose, joints = mech.home()
+    leaves, tree = jax.tree.flatten(mech)
+    rebuilt = jax.tree.unflatten(tree, leaves)  # outside of jit, which would rebuild both
+    same = rebuilt.residual(pose, joints) == mech.residual(pose, joints)
+    errors = {"a pytree: flatten and unflatten change nothing": jnp.sum(~same)}
+    values = _measured(mech)
+    return errors | dict(zip(_names[tree], values, strict=True))
 
-    @jax.jit  # one compilation for all laws
-    def measure(mech):
-        found = dict(_measure(mech))
-        names.extend(found)  # jit would sort a dict
-        return list(found.values())
 
-    values = measure(mech)
-    return dict(zip(names, values, strict=True))
+_names: dict[Any, tuple[str, ...]] = {}  # of the laws, by class: jit would sort a dict
+
+
+@jax.jit  # one compilation for all laws and for all mechanisms of a class
+def _measured(mech: Mechanism) -> list[jax.Array]:
+    found = dict(_measure(mech))
+    _names[jax.tree.structure(mech)] = tuple(found)
+    return list(found.values())
 
 
 def _measure(mech: Mechanism):
@@ -148,13 +165,13 @@ def _measure(mech: Mechanism):
     margins = [jnp.min(v) for v in mech.margins(home, home_joints).values()]
     yield "home is inside every margin", -jnp.min(jnp.stack([*margins, jnp.zeros_like(least)]))
 
-    leaves, tree = jax.tree.flatten(mech)
-    rebuilt = jax.tree.unflatten(tree, leaves)
-    same = rebuilt.residual(home, home_joints) == mech.residual(home, home_joints)
-    yield "a pytree: flatten and unflatten change nothing", jnp.sum(~same)
-
-    poses = home + SPREAD * dx * _spread(SAMPLES, n, home.dtype)
-    solved = inverse_kinematics(mech, poses)
+    jacobians = scaled_jacobians(mech, home, home_joints)
+    sigmas = [jnp.linalg.svd(j, compute_uv=False)[-1] for j in jacobians]
+    spread = SPREAD * jnp.minimum(1, jnp.minimum(*sigmas))  # a singularity is about this far, or more
+    poses = home + spread * dx * _spread(SAMPLES, n, home.dtype)
+    both = jnp.stack([poses, poses.at[1].set(jnp.nan)])  # through one program, so that bits compare
+    rows = lax.map(lambda poses: inverse_kinematics(mech, poses), both)
+    solved, poisoned = (jax.tree.map(lambda leaf, i=i: leaf[i], rows) for i in range(2))
     joints = solved.joints
     yield "inverse kinematics is OK near home (rows lost)", _lost(solved.status)
     closed = jax.vmap(lambda x, q: is_closed(mech, x, q))(poses, joints)
@@ -199,7 +216,14 @@ def _measure(mech: Mechanism):
     infinite = [jnp.sum(~jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)]
     yield "derivatives in the geometry are finite (entries lost)", sum(infinite)
 
-    poisoned = inverse_kinematics(mech, poses.at[1].set(jnp.nan))
+    tangent = jax.tree.map(lambda leaf: leaf * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape), mech)
+    moved = lambda h: jax.tree.map(lambda leaf, rate: leaf + h[0] * rate, mech, tangent)
+    of_residual = jax.jvp(lambda g: g.residual(pose, q), (mech,), (tangent,))[1]
+    central = _central(lambda h: moved(h).residual(pose, q), 1, eps ** (1 / 3), pose.dtype)
+    yield "dF/d(geometry) against central differences", _gap(of_residual[:, None], central, size)
+    of_inverse = jax.jvp(lambda g: inverse_kinematics(g, pose).joints, (mech,), (tangent,))[1]
+    yield "geometry: dF + B dq = 0", jnp.max(jnp.abs(of_residual + b @ of_inverse) / size[:, 0])
+
     yield "a NaN row is told", poisoned.status[1] != Status.NONFINITE
     others = np.delete(np.arange(SAMPLES), 1)
     yield "a NaN row changes no other row", jnp.sum(poisoned.joints[others] != joints[others])

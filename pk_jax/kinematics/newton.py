@@ -109,8 +109,12 @@ def implicit(
     def dense_solve(linear_map, rhs):
         return jnp.linalg.solve(jax.jacobian(linear_map)(jnp.zeros_like(rhs)), rhs)
 
-    dtype = jax.tree.leaves(point)[0].dtype
-    increment = lax.custom_root(equation, jnp.zeros(size, dtype), lambda _, guess: guess, dense_solve)
+    # zeros that are batched wherever the point is: an unbatched root with a batched derivative
+    # breaks the vmap of custom_root (TypeError in broadcast_in_dim, jax 0.10)
+    leaves = jax.tree.leaves(point)
+    zero = 0 * sum(jnp.sum(jnp.isfinite(leaf)) for leaf in leaves)
+    start = jnp.zeros(size, leaves[0].dtype) + zero
+    increment = lax.custom_root(equation, start, lambda _, guess: guess, dense_solve)
     return retract(point, increment)
 
 

@@ -62,7 +62,7 @@ class Mechanism(abc.ABC):
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if value is not None:
+            if value is not None or field.default is not None:  # None only where it is the default
                 array = checks.real_array(f"{type(self).__name__}.{field.name}", value)
                 object.__setattr__(self, field.name, array)
         self.check_shapes()

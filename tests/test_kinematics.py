@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 from outsiders import delta, three_legs, three_rpr
 
 import pk_jax as pk
@@ -291,6 +292,45 @@ def test_gradients_at_the_ends_of_the_reach_are_zero(gradients):
     alone, _ = gradients[0](ARMS, np.array([poses[0], [NAN, 0], [NAN, 0], [NAN, 0]]))
     for mine, theirs in zip(jax.tree.leaves(in_geometry), jax.tree.leaves(alone), strict=True):
         assert np.isfinite(mine) and mine == theirs != 0
+
+
+class Rail(pk.LegMechanism):
+    """Two carriages on the x axis and a rod each, with the inverse as one writes it down first."""
+
+    rod: jax.Array
+
+    def attachments(self):
+        return jnp.zeros((2, 2))
+
+    def legs(self, points, joints):
+        return ((points[:, 0] - joints) ** 2 + points[:, 1] ** 2 - self.rod**2) / 2
+
+    def inverse(self, pose, branch=None, *, free=None):
+        return pose[0] + jnp.sqrt(self.rod**2 - pose[1] ** 2) * jnp.array([1.0, -1.0])
+
+    def home(self):
+        pose = lax.stop_gradient(jnp.stack([0 * self.rod, 0.6 * self.rod]))
+        return pose, self.inverse(pose)
+
+    def length(self):
+        return self.rod
+
+    def margins(self, pose, joints):
+        return {}
+
+    def skeleton(self, pose, joints):
+        return pk.Skeleton(pose[None], ())
+
+
+def test_a_users_unguarded_square_root_is_guarded(gradients):
+    """NaN beyond the rod's reach and an infinite derivative at its end: neither gets out."""
+    rail, poses = Rail(rod=1.0), np.array([[0.1, 0.6], [0.0, 1.5], [0.0, 1.0], [NAN, 0.0]])
+    assert statuses(pk.inverse_kinematics(rail, poses)) == ["OK", "UNREACHABLE", "SINGULAR", "NONFINITE"]
+    in_geometry, in_pose = gradients[0](rail, poses)
+    np.testing.assert_array_equal(in_pose[1:], 0)
+    expected = np.cos(0.9) - np.cos(-0.7)  # of sin(x + s) + sin(x - s) in s = sqrt(rod^2 - y^2) = 0.8
+    np.testing.assert_allclose(in_geometry.rod, expected / 0.8, rtol=1e-13)
+    np.testing.assert_allclose(in_pose[0], [np.cos(0.9) + np.cos(0.7), -0.75 * expected], rtol=1e-13)
 
 
 # ---------------------------------------------------------------- derivatives

@@ -1,5 +1,7 @@
 """Global indices: oracles, published digits, error estimates, gradients, refusals."""
 
+import subprocess
+import sys
 from functools import cache
 
 import jax
@@ -313,6 +315,24 @@ def test_unknown_rule_and_mechanism():
         pk.workspace_indices(two_rpr(1.5), "simpson")
     with pytest.raises(ValueError, match="takes a TwoRPR or a FiveBar, got str"):
         pk.workspace_indices("2-rpr")
+
+
+def test_single_precision():
+    """Gauss and paper keep six digits; eq. (29) would be wrong without a word, and is refused."""
+    code = (
+        "import numpy as np, pk_jax as pk\n"
+        "mech = pk.FiveBar(half_base=1, proximal=1.39, distal=2.69, reach=(2.08, 4.08))\n"
+        "found = pk.workspace_indices(mech)\n"
+        "assert found.gii.dtype == np.float32 and found.status == pk.Status.OK\n"
+        "assert abs(found.gii - 0.6897323171) < max(1e-5, float(found.error.gii)) < 1e-4\n"
+        "assert abs(found.gri - 0.8815539900) < 2e-5\n"
+        "assert abs(pk.workspace_indices(mech, 'paper').gri - 0.786086) < 2e-5\n"
+        "try: pk.workspace_indices(mech, 'midpoint')\n"
+        "except ValueError as told: assert 'needs float64' in str(told)\n"
+        "else: raise SystemExit('midpoint was not refused')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_constructed_inside_jit():

@@ -24,7 +24,8 @@ from pk_jax.mechanisms.five_bar import FiveBar
 from pk_jax.mechanisms.two_rpr import TwoRPR
 from pk_jax.status import Status
 
-MOST_NODES = {"gauss": 512, "midpoint": 20_000, "paper": 20_000}  # per direction: bounds the memory
+# per direction: bounds the memory of gauss; nodes of the others must resolve the workspace's tips
+MOST_NODES = {"gauss": 512, "midpoint": 2000, "paper": 2000}
 COARSER = {24: 16, 10: 8, 8: 6}  # the second rule of the error estimate; otherwise two thirds
 
 
@@ -58,7 +59,7 @@ def workspace_indices(
     ValueError, or NaN with Status.BAD_INPUT where the values are not known yet (under jit).
 
     rule:   "gauss": the area-weighted integrals, with an error estimate;
-            "midpoint": eq. (29) taken literally, mid-point rings, converging like nodes^-1/2;
+            "midpoint": eq. (29) taken literally, mid-point rings, converging like nodes^-1/2 (float64);
             "paper": the discretization behind the printed tables, recovered from them: interior
             radii only, all radii of a sector weighing the same, no node within 3.6 degrees of y = 0
     nodes:  (outer, inner). gauss: Gauss nodes in each of 3 x 3 panels, default (24, 24), for the
@@ -81,6 +82,11 @@ def workspace_indices(
         raise ValueError(f"nodes must be two integers (outer, inner), got {nodes!r}")
     least = 4 if rule == "paper" else 2
     nodes = tuple(checks.is_count("nodes", count, least=least, most=MOST_NODES[rule]) for count in nodes)
+    if rule == "midpoint" and mech.half_base.dtype != jnp.float64:
+        raise ValueError(
+            "rule 'midpoint' needs float64, whose digits resolve its nodes at the tips of the workspace: "
+            "call pk_jax.enable_x64() first"
+        )
     if checks.is_concrete(mech):
         with jax.ensure_compile_time_eval():
             _require_admissible(mech)

@@ -10,16 +10,19 @@ import jax.numpy as jnp
 from pk_jax.mechanisms.base import Mechanism
 
 
+@jax.jit
 def pose_jacobian(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
     """A = dF/dx in the tangent of the pose (Jx of Nam, Lee and Park 2006, eqs. 11, 15). -> (c, n)"""
     return mech.linearize(pose, joints)[1]
 
 
+@jax.jit
 def joint_jacobian(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
     """B = dF/dq (minus Jq of Nam, Lee and Park 2006, eqs. 10, 14). -> (c, m)"""
     return jax.jacfwd(lambda q: mech.residual(pose, q))(joints)
 
 
+@jax.jit
 def velocity_jacobian(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
     """J with x' = J q': -A^-1 B (eq. 8), or the pseudo-inverse of -B^-1 A when c > n. -> (n, m)
 

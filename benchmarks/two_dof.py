@@ -232,7 +232,7 @@ def optimum() -> None:
     print(f"\nindex evaluations to within 1e-6 of the greatest CPI, {result.objective:.9f}")
     print("(value + gradient counts as 3; every method moves in the same box)")
     print(f"  pk_jax from (l_min, v) = {tuple(START)}: {ours}, ", end="")
-    print(f"{3 * result.evaluations} until it stops, {seconds:.2f} s")
+    print(f"{3 * result.evaluations} until it stops ({seconds:.1f} s with compile)")
     print(f"  pk_jax, multi-start of 12: {3 * multi.evaluations_in_all} until every start stops")
 
     one = indices((24, 24))

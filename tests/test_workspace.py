@@ -13,7 +13,7 @@ from two_dof_oracles import duffy, equation_29, paper_rule
 import pk_jax as pk
 from pk_jax.analysis.workspace import workspace_area
 
-SPACE = pk.design_space("2-rrr")
+SPACE, RPR = pk.design_space("2-rrr"), pk.design_space("2-rpr")
 SQRT2 = np.sqrt(2)
 
 
@@ -333,6 +333,15 @@ def test_single_precision():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_batch_that_is_not_vmapped():
+    several = jax.vmap(RPR.mechanism)(jnp.array([[1.2], [1.5]]))
+    with pytest.raises(ValueError, match=r"takes one design; for a batch: jax\.vmap"):
+        pk.workspace_indices(several)
+    np.testing.assert_allclose(
+        jax.vmap(pk.workspace_indices)(several).gii[1], pk.workspace_indices(two_rpr(1.5)).gii, rtol=1e-14
+    )
 
 
 def test_constructed_inside_jit():

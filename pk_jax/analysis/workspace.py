@@ -26,7 +26,6 @@ from pk_jax.status import Status
 
 # per direction: bounds the memory of gauss; nodes of the others must resolve the workspace's tips
 MOST_NODES = {"gauss": 512, "midpoint": 2000, "paper": 2000}
-COARSER = {24: 16, 10: 8, 8: 6}  # the second rule of the error estimate; otherwise two thirds
 
 
 class IndexErrors(NamedTuple):
@@ -76,6 +75,8 @@ def workspace_indices(
         raise ValueError(f"rule must be one of {', '.join(map(repr, _RULES))}, got {rule!r}")
     if not isinstance(mech, TwoRPR | FiveBar):
         raise ValueError(f"workspace_indices takes a TwoRPR or a FiveBar, got {type(mech).__name__}")
+    if mech.half_base.ndim:
+        raise ValueError("workspace_indices takes one design; for a batch: jax.vmap(pk.workspace_indices)")
     if nodes is None:
         nodes = {"midpoint": (200, 300), "paper": (50, 100)}.get(rule, _GAUSS_NODES[type(mech)])
     if not isinstance(nodes, tuple | list) or len(nodes) != 2:
@@ -133,16 +134,11 @@ def _slacks(mech: Mechanism) -> list[tuple[str, jax.Array]]:
 
 def _require_admissible(mech: Mechanism) -> None:
     for what, slack in _slacks(mech):
-        if not bool(jnp.all(slack >= 0)):
+        if not slack >= 0:
+            l_min, l_max = _stroke(mech)
             raise ValueError(
-                f"workspace_indices needs {what}; got {mech!r} with l_min, l_max = {_text(mech)}"
+                f"workspace_indices needs {what}; got {mech!r}, l_min {l_min:.9g}, l_max {l_max:.9g}"
             )
-
-
-def _text(mech: Mechanism) -> str:
-    return (
-        ", ".join(f"{float(limit):.9g}" for limit in _stroke(mech)) if mech.half_base.ndim == 0 else "a batch"
-    )
 
 
 def _some_design(mech: Mechanism) -> Mechanism:
@@ -177,7 +173,7 @@ def _gauss(mech: Mechanism, nodes: tuple[int, int]):
     l_min, v = _coordinates(mech)
     size = workspace_area(l_min)
     means = _mean_indices(mech, l_min, v, nodes)
-    coarse = tuple(COARSER.get(count, max(2, 2 * count // 3)) for count in nodes)
+    coarse = tuple(max(1, count - max(2, count // 3)) for count in nodes)
     other = lax.stop_gradient(_mean_indices(mech, l_min, v, coarse))
     gii, gri = means
     sui, area = size / enclosing_box(l_min), size * mech.half_base**2

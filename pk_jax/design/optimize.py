@@ -22,6 +22,7 @@ from pk_jax.design.objective import (
     require_weights,
 )
 from pk_jax.design.variables import DesignSpace
+from pk_jax.geometry.spread import evenly
 from pk_jax.mechanisms.base import Mechanism
 from pk_jax.status import Status
 
@@ -79,8 +80,10 @@ def optimize_design(
     if not isinstance(space, DesignSpace):
         raise ValueError(f"space must come from design_space(...), got {type(space).__name__}")
     weights = require_weights(weights)
-    bounds = index_bounds(space) if bounds is None else require_bounds(bounds)
     checks.is_count("steps", steps, most=100_000)
+    _tolerance(tolerance)
+    _start_boxes(space, starts)  # what is wrong is told before anything is computed
+    bounds = index_bounds(space, report=report) if bounds is None else require_bounds(bounds)
     slopes = weights / (bounds.upper - bounds.lower)
     found = maximize(space, slopes[None], starts=starts, steps=steps, tolerance=tolerance, report=report)[0]
 
@@ -143,12 +146,7 @@ def maximize(
     report: Report | None = None,
 ) -> list[Maximum]:
     """Maximize slopes[i] @ (gii, gri, sui) for every row of slopes (k, 3), all in one batch."""
-    slopes, size = np.asarray(slopes), len(space.variables)
-    if isinstance(starts, int | np.integer):
-        boxes = _even(checks.is_count("starts", starts, most=10_000), size)
-    else:
-        vectors = jnp.atleast_2d(space.require("starts", starts))
-        boxes = np.asarray(jax.vmap(space.to_box)(vectors))
+    slopes, boxes = np.asarray(slopes), _start_boxes(space, starts)
     count = len(boxes)
     trail = _climb(
         space, np.repeat(slopes, count, axis=0), np.tile(boxes, (len(slopes), 1)), steps, tolerance, report
@@ -251,13 +249,13 @@ def _optimality(space: DesignSpace, vector: jax.Array, slopes: jax.Array):
     return tuple(active), multipliers, float(best[2])
 
 
-def _even(count: int, dimension: int) -> np.ndarray:
-    """Starts spread evenly inside the unit box, the same every time (an additive sequence). (count, n)"""
-    root = 2.0
-    for _ in range(30):
-        root = (1 + root) ** (1 / (dimension + 1))
-    steps = root ** -np.arange(1.0, dimension + 1)
-    return (0.02 + 0.96 * ((0.5 + np.arange(count)[:, None] * steps) % 1)).astype(jnp.zeros(()).dtype)
+def _start_boxes(space: DesignSpace, starts: Any) -> np.ndarray:
+    """Starts in the unit box: so many, spread evenly inside it, or those of design vectors. -> (k, n)"""
+    if isinstance(starts, int | np.integer):
+        count = checks.is_count("starts", starts, most=10_000)
+        inside = 0.02 + 0.96 * evenly(count, len(space.variables))
+        return inside.astype(jnp.zeros(()).dtype)
+    return np.asarray(jax.vmap(space.to_box)(jnp.atleast_2d(space.require("starts", starts))))
 
 
 def _tolerance(tolerance: float | None) -> float:

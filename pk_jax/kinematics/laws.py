@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 
 from pk_jax.geometry.poses import retract
+from pk_jax.geometry.spread import evenly
 from pk_jax.kinematics.closure import is_closed, joint_scale, pose_scale
 from pk_jax.kinematics.forward import forward_kinematics
 from pk_jax.kinematics.inverse import inverse_kinematics
@@ -236,13 +237,8 @@ def _central(function, count: int, step: float, dtype) -> jax.Array:
 
 
 def _spread(rows: int, columns: int, dtype) -> jax.Array:
-    """Evenly spread points in [-1, 1]^columns, the same every time (an additive sequence)."""
-    root = 2.0
-    for _ in range(30):
-        root = (1 + root) ** (1 / (columns + 1))
-    steps = root ** -np.arange(1, columns + 1)
-    points = (0.5 + np.arange(1, rows + 1)[:, None] * steps) % 1
-    return jnp.asarray(2 * points - 1, dtype)
+    """Evenly spread points in [-1, 1]^columns. -> (rows, columns)"""
+    return jnp.asarray(2 * evenly(rows + 1, columns)[1:] - 1, dtype)  # the first is the centre
 
 
 def _gap(a, b, scale) -> jax.Array:

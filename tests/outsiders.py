@@ -78,7 +78,7 @@ class ThreeRPR(pk.LegMechanism):
 
         def clearance(pose):
             a = self.linearize(pose, self.inverse(pose))[1] * jnp.stack([1, 1, 1 / self.length()])
-            return jnp.linalg.svd(a / jnp.linalg.norm(a, axis=1, keepdims=True), compute_uv=False)[-1]
+            return jnp.abs(jnp.linalg.det(a / jnp.linalg.norm(a, axis=1, keepdims=True)))
 
         pose = lax.stop_gradient(poses[jnp.nanargmax(jax.vmap(clearance)(poses))])
         return pose, self.inverse(pose)

@@ -30,6 +30,9 @@ def test_the_box_is_the_feasible_set(space):
     for box in boxes:
         vector = space.from_box(jnp.asarray(box))
         assert min(space.constraints(vector).values()) >= -1e-12
+        assert np.all(vector >= np.array(space.bounds[0])) and np.all(
+            vector <= np.array(space.bounds[1]) + 1e-15
+        )
         again = space.from_box(space.to_box(vector))
         np.testing.assert_allclose(again, vector, atol=1e-12)
 

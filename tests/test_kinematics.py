@@ -336,10 +336,8 @@ def test_a_users_unguarded_square_root_is_guarded(gradients):
 # ---------------------------------------------------------------- derivatives
 
 SMOOTH = {
-    "2-RPR": (RPR, np.array([1.7, 2.2])),
     "2-RRR": (ARMS, np.array([0.7, 2.3])),
     "Delta": (DELTA, np.array([0.2, -0.1, 0.3])),
-    "planar 3-RPR": (PLANAR, np.array([0.68, 0.7, 0.6])),
 }
 
 

@@ -492,3 +492,19 @@ def test_geometry_gradient_is_a_mechanism(mech, pose):
 def test_home_has_no_derivative_of_its_pose():
     gradient = jax.grad(lambda mech: jnp.sum(home(mech)[0]))(five_bar(1.0, 1.0, 2.15))
     assert [float(leaf) for leaf in jax.tree.leaves(gradient)] == [0, 0, 0]
+
+
+def test_five_bar_elbow_angles_are_eq_21():
+    mech = pk.FiveBar(half_base=1.0, proximal=1.3, distal=1.9)
+    pose = jnp.array([0.4, 1.7])
+    for branch in ([1.0, -1.0], [-1.0, -1.0]):
+        elbows = mech.elbows(mech.inverse(pose, jnp.array(branch)))
+        back, on = mech.base() - elbows, pose - elbows
+        cosine = np.sum(back * on, axis=1) / (1.3 * 1.9)
+        np.testing.assert_allclose(np.cos(mech.elbow_angles(pose)), cosine, atol=1e-14)
+    stretched, folded = jnp.array([1.0, 3.2]), jnp.array([1.0, 0.6])
+    np.testing.assert_allclose(mech.elbow_angles(stretched)[0], np.pi, atol=1e-7)
+    np.testing.assert_allclose(mech.elbow_angles(folded)[0], 0, atol=1e-7)
+    assert np.isnan(mech.elbow_angles(jnp.array([1.0, 3.3]))[0])
+    slopes = jax.jacfwd(mech.elbow_angles)(stretched)
+    assert np.all(np.isfinite(slopes))

@@ -26,6 +26,7 @@ class DesignSpace(abc.ABC):
 
     name: str
     variables: tuple[str, ...]
+    bounds: tuple[tuple[float, ...], tuple[float, ...]]  # least and greatest value of each variable
 
     @abc.abstractmethod
     def mechanism(self, vector: jax.Array) -> Mechanism:
@@ -71,20 +72,20 @@ class TwoRPRSpace(DesignSpace):
 
     name = "2-rpr"
     variables = ("l_min",)
-    upper = 3.0
+    bounds = ((1.0,), (3.0,))
 
     def mechanism(self, vector: jax.Array) -> TwoRPR:
         l_min = vector[0]
         return TwoRPR(half_base=jnp.ones_like(l_min), l_min=l_min, l_max=l_min + 2)
 
     def constraints(self, vector: jax.Array) -> dict[str, jax.Array]:
-        return {"l_min = R": vector[0] - 1, "l_min = 3 R": self.upper - vector[0]}
+        return {"l_min = R": vector[0] - 1, "l_min = 3 R": 3 - vector[0]}
 
     def from_box(self, box: jax.Array) -> jax.Array:
-        return 1 + (self.upper - 1) * box
+        return 1 + 2 * box
 
     def to_box(self, vector: jax.Array) -> jax.Array:
-        return (vector - 1) / (self.upper - 1)
+        return (vector - 1) / 2
 
 
 class TwoRRRSpace(DesignSpace):
@@ -96,7 +97,7 @@ class TwoRRRSpace(DesignSpace):
 
     name = "2-rrr"
     variables = ("l_min", "v")
-    upper = 5.0
+    bounds = ((1.0, 0.0), (5.0, math.sqrt(2)))
 
     def mechanism(self, vector: jax.Array) -> FiveBar:
         l_min, v = vector
@@ -114,19 +115,19 @@ class TwoRRRSpace(DesignSpace):
             "l_min = R": l_min - 1,
             "v = 0": v,
             "lb - la = R": l_min - 1 - 2 * v**2,
-            "l_min = 5 R": self.upper - l_min,
+            "l_min = 5 R": 5 - l_min,
         }
 
     def from_box(self, box: jax.Array) -> jax.Array:
-        v = box[1] * math.sqrt((self.upper - 1) / 2)
+        v = box[1] * math.sqrt(2)
         least = 1 + 2 * v**2  # lb - la = R
-        return jnp.stack([least + box[0] * (self.upper - least), v])
+        return jnp.stack([least + box[0] * (5 - least), v])
 
     def to_box(self, vector: jax.Array) -> jax.Array:
         l_min, v = vector
         least = 1 + 2 * v**2
-        share = safe.divide(l_min - least, self.upper - least)
-        return jnp.clip(jnp.stack([share, v / math.sqrt((self.upper - 1) / 2)]), 0, 1)
+        share = safe.divide(l_min - least, 5 - least)
+        return jnp.clip(jnp.stack([share, v / math.sqrt(2)]), 0, 1)
 
 
 _SPACES = {space.name: space for space in (TwoRPRSpace(), TwoRRRSpace())}

@@ -88,6 +88,16 @@ class FiveBar(LegMechanism):
         """Where the driven links end. -> (2, 2)"""
         return self.base() + self.proximal * direction(joints)
 
+    def elbow_angles(self, pose: jax.Array) -> jax.Array:
+        """Passive angles between the links of each leg, eq. (21): pi stretched, 0 folded. -> (2,)
+
+        NaN for a leg that the pose is out of reach of.
+        """
+        squared = jnp.sum((pose - self.base()) ** 2, axis=-1)
+        cosine = (self.proximal**2 + self.distal**2 - squared) / (2 * self.proximal * self.distal)
+        roundoff = 8 * jnp.finfo(pose.dtype).eps
+        return jnp.where(jnp.abs(cosine) <= 1 + roundoff, safe.arccos(cosine), jnp.nan)
+
     def attachments(self) -> jax.Array:
         return jnp.zeros((2, 2), self.half_base.dtype)
 

@@ -6,6 +6,7 @@ import csv
 import io
 import os
 from collections.abc import Callable
+from importlib.metadata import version
 from typing import Any
 
 import jax
@@ -111,6 +112,7 @@ def as_json(found: Reproduction) -> dict[str, Any]:
     return {
         "source": "Nam, Lee and Park 2006, Trans. KSME A 30(11), Tables 1 and 2",
         "units": "lengths over R",
+        "versions": {name: version(name) for name in ("pk_jax", "jax", "optax", "numpy")},
         "cells": [cell._asdict() for cell in found.cells],
         "claims": [claim._asdict() | {"holds": bool(claim.holds)} for claim in found.claims],
         "optima": [

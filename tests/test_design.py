@@ -145,7 +145,7 @@ def test_space_must_be_a_space():
 # --- ascent, on functions with known maxima
 
 
-def climb(function, starts, steps=60, tolerance=1e-9):
+def climb(function, starts, steps=60, tolerance=1e-9, values=None):
     def advance(state):
         return ascent.judge(state, *jax.value_and_grad(function)(ascent.propose(state)), tolerance)
 
@@ -153,6 +153,8 @@ def climb(function, starts, steps=60, tolerance=1e-9):
     states = jax.vmap(ascent.begin)(jnp.asarray(starts))
     for _ in range(steps):
         states = step(states)
+        if values is not None:
+            values.append(states.value)
     return states
 
 
@@ -173,6 +175,21 @@ def test_a_curved_valley():
         lambda x: -(100 * (x[1] - x[0] ** 2) ** 2 + (0.7 - x[0]) ** 2 + x[2] ** 2), STARTS, steps=150
     )
     np.testing.assert_allclose(states.box, np.tile([0.7, 0.49, 0.0], (8, 1)), atol=1e-5)
+
+
+def test_no_step_goes_down():
+    """Steep and wavy: most full steps overshoot, and none that loses may be accepted."""
+    wavy = lambda x: jnp.sum(jnp.sin(25 * x)) - 8 * jnp.sum((x - 0.4) ** 2)
+    values = []
+    climb(wavy, STARTS, steps=24, values=values)
+    assert np.all(np.diff(np.array(values), axis=0) >= 0)
+
+
+def test_a_nan_gradient_is_no_step_either():
+    """At 0.7 the value goes on, but its derivative there is 0 * inf."""
+    edge = lambda x: jnp.sum(x) + 0 * jnp.sqrt(jnp.maximum(0.7 - x[0], 0))
+    states = climb(edge, np.full((1, 3), 0.4))
+    assert np.all(np.isfinite(states.gradient)) and states.box[0, 0] < 0.7
 
 
 def test_a_finished_start_stays_and_a_nan_is_no_step():

@@ -200,6 +200,17 @@ def test_gradients_against_central_differences():
         assert np.max(np.abs(slopes()(designs)[:, :, j] - central)) < 1e-6
 
 
+def test_gradients_beside_a_degenerate_curve():
+    """lb = sqrt 2 (1 + la): panel borders that followed the design there would miss by 1e-5."""
+    designs = np.array([[2.1658333333333335, 0.37397623938651525], [2.315, 0.4490490886451058]])
+    fine = lambda z: batch((44, 52))(z)[0]
+    for j in range(2):
+        step = 2e-4 * np.eye(2)[j]
+        first = (fine(designs + step) - fine(designs - step)) / 4e-4
+        second = (fine(designs + 2 * step) - fine(designs - 2 * step)) / 8e-4
+        assert np.max(np.abs(slopes()(designs)[:, :, j] - (4 * first - second) / 3)) < 2e-6
+
+
 def test_gradients_are_finite_everywhere():
     assert np.all(np.isfinite(slopes()(scan())))
 

@@ -174,16 +174,19 @@ def _climb(space, slopes, boxes, steps, tolerance, report) -> list[ascent.Ascent
     """Ascend from boxes (lanes, n) with slopes (lanes, 3). -> the states after every step"""
     states = jax.vmap(ascent.begin)(jnp.asarray(boxes))
     trail = []
+    running = np.arange(len(boxes))  # finished lanes are neither evaluated nor changed
+    value, gradient = np.zeros(len(boxes), boxes.dtype), np.zeros_like(boxes)
     for done in range(1, steps + 1):
-        vectors, chain = _propose(space, states)
+        vectors, chain = (np.asarray(part)[running] for part in _propose(space, states))
         indices, gradients = indices_and_slopes(space, vectors)
-        value = np.einsum("li,li->l", slopes, indices)
-        gradient = np.einsum("li,lij,ljk->lk", slopes, gradients, np.asarray(chain))
+        value[running] = np.einsum("li,li->l", slopes[running], indices)
+        gradient[running] = np.einsum("li,lij,ljk->lk", slopes[running], gradients, chain)
         states = _judge(states, value, gradient, _tolerance(tolerance))
         trail.append(jax.device_get(states._replace(memory=None)))
         if report is not None:
             report(space.name, done, steps, float(np.nanmax(trail[-1].value)))
-        if trail[-1].is_done.all():
+        running = np.flatnonzero(~trail[-1].is_done)
+        if not len(running):
             break
     return trail
 

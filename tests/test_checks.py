@@ -176,3 +176,11 @@ def test_a_long_value_is_cut_short():
     with pytest.raises(ValueError) as caught:
         checks.is_finite("lengths", np.full(1000, np.nan))
     assert len(str(caught.value)) < 120 and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "function", [pk.inverse_kinematics, pk.forward_kinematics, pk.local_indices], ids=lambda f: f.__name__
+)
+def test_what_is_no_mechanism_is_told(function):
+    with pytest.raises(ValueError, match=rf"^{function.__name__} takes a pk_jax\.Mechanism, got int$"):
+        function(3, [0.3, 2.2])

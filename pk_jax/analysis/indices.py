@@ -12,7 +12,7 @@ from pk_jax.geometry import safe
 from pk_jax.kinematics.batching import over_rows, rows_of
 from pk_jax.kinematics.inverse import SINGULAR_BELOW, branch_rows, inverse_kinematics
 from pk_jax.kinematics.jacobian import ScaledJacobians, scaled_jacobians, units
-from pk_jax.mechanisms.base import Mechanism
+from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
 
 
@@ -38,6 +38,7 @@ def local_indices(mech: Mechanism, pose: Any, branch: Any = None) -> LocalIndice
     derivatives are finite everywhere; at an exactly isotropic pose, where 1/kappa has a conical
     point, the derivative of the isotropy is the mean of the directional ones, 0.
     """
+    require_mechanism("local_indices", mech)
     home_pose, home_joints = jax.eval_shape(mech.home)
     pose = rows_of("pose", pose, home_pose)
     batched = (pose.ndim > home_pose.ndim,)

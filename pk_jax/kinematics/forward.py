@@ -15,7 +15,7 @@ from pk_jax.kinematics.batching import all_finite, over_rows, rows_of
 from pk_jax.kinematics.closure import is_closed, pose_scale
 from pk_jax.kinematics.inverse import SINGULAR_BELOW
 from pk_jax.kinematics.jacobian import scaled_jacobians
-from pk_jax.mechanisms.base import Mechanism
+from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
 
 INCONSISTENT_ABOVE = 1e-6  # of the size of each closure equation, for redundant mechanisms
@@ -46,6 +46,7 @@ def forward_kinematics(mech: Mechanism, joints: Any, guess: Any = None) -> Forwa
     equal det_sign means "same side of the singularity", not "same assembly mode".
     The pose carries exact derivatives in the joints and the geometry; zero on rows that are not OK.
     """
+    require_mechanism("forward_kinematics", mech)
     home_pose, home_joints = jax.eval_shape(mech.home)
     joints = rows_of("joints", joints, home_joints)
     batched = (joints.ndim > home_joints.ndim,)

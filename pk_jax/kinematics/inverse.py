@@ -15,7 +15,7 @@ from pk_jax.kinematics import newton
 from pk_jax.kinematics.batching import all_finite, over_rows, rows_of
 from pk_jax.kinematics.closure import is_closed, joint_scale
 from pk_jax.kinematics.jacobian import joint_jacobian, scaled_jacobians
-from pk_jax.mechanisms.base import Mechanism
+from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
 
 SINGULAR_BELOW = 1e-6  # sine of an angle; a reach limit itself is only known to sqrt(eps)
@@ -44,6 +44,7 @@ def inverse_kinematics(
     (STALLED where that ends elsewhere). BAD_INPUT: a traced branch that holds no signs.
     The derivative of a row that is not OK is zero.
     """
+    require_mechanism("inverse_kinematics", mech)
     home_pose, home_joints = jax.eval_shape(mech.home)
     pose = rows_of("pose", pose, home_pose)
     batched = (pose.ndim > home_pose.ndim,)
@@ -69,7 +70,6 @@ def _solve(mech, pose_and_branch, free, are_batched):
 def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = None) -> InverseKinematics:
     home_pose, home_joints = mech.home()
     is_given = all_finite(pose)
-    is_mode = True if branch is None else jnp.all(jnp.abs(branch) == 1)
     is_mode = True if branch is None else jnp.all(jnp.abs(branch) == 1)
     pose = jnp.where(is_given, pose, home_pose)  # lost rows work on the home pose and are masked after
     if hasattr(mech, "inverse"):

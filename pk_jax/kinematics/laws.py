@@ -15,7 +15,7 @@ from pk_jax.kinematics.closure import is_closed, joint_scale, pose_scale
 from pk_jax.kinematics.forward import forward_kinematics
 from pk_jax.kinematics.inverse import inverse_kinematics
 from pk_jax.kinematics.jacobian import joint_jacobian, pose_jacobian, scaled_jacobians
-from pk_jax.mechanisms.base import Mechanism
+from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
 
 SAMPLES = 12
@@ -49,8 +49,7 @@ def check_mechanism(mech: Mechanism) -> LawReport:
     its error and the tolerance, or the contract method whose answer has the wrong shape. Call it
     with float64 enabled: the tolerances come from the precision in use.
     """
-    if not isinstance(mech, Mechanism):
-        raise ValueError(f"check_mechanism takes a pk_jax.Mechanism, got {type(mech).__name__}")
+    require_mechanism("check_mechanism", mech)
     name = type(mech).__name__
     _check_contract(mech, name)
     laws = LawReport(Law(what, float(error), float(allowed)) for what, error, allowed in _laws(mech))

@@ -152,3 +152,9 @@ class LegMechanism(Mechanism):
         forces = jax.vmap(lambda seed: pull_back(seed)[0])(seeds)  # (e, k, d)
         rows = jnp.einsum("ekd,kdn->ken", forces, place_jacobian(pose, attachments))
         return value.reshape(-1), rows.reshape(-1, rows.shape[-1])
+
+
+def require_mechanism(function: str, mech: Any) -> None:
+    """ValueError, naming the function that was called, where `mech` is no mechanism."""
+    if not isinstance(mech, Mechanism):
+        raise ValueError(f"{function} takes a pk_jax.Mechanism, got {type(mech).__name__}")

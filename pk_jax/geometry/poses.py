@@ -1,30 +1,59 @@
 """What a pose is, how it moves, and where it carries the platform's points.
 
 A pose is an array of coordinates, moved by addition: (x, y) and (x, y, z) are translations,
-(x, y, phi) with planar points is a planar rigid motion whose tangent is (x', y', phi').
+(x, y, phi) with planar points is a planar rigid motion whose tangent is (x', y', phi'). Or it is
+an `SE3`, moved by a translation and a rotation in base axes.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from pk_jax.geometry.planar import rotation
+from pk_jax.geometry.rotations import cayley
+from pk_jax.geometry.se3 import SE3
+
+Pose = Any  # jax.Array or SE3
 
 
-def retract(pose: jax.Array, twist: jax.Array) -> jax.Array:
+def retract(pose: Pose, twist: jax.Array) -> Pose:
     """The pose reached from `pose` by the tangent increment `twist` (n,)."""
+    if isinstance(pose, SE3):
+        moved = (pose.translation + twist[:3], cayley(twist[3:]) @ pose.rotation)
+        return jax.tree.unflatten(jax.tree.structure(pose), moved)
     return pose + twist
 
 
-def tangent_zero(pose: jax.Array) -> jax.Array:
+def tangent_size(pose: Pose) -> int:
+    """n, the number of degrees of freedom."""
+    return 6 if isinstance(pose, SE3) else pose.shape[0]
+
+
+def tangent_zero(pose: Pose) -> jax.Array:
     """The zero tangent at `pose`. -> (n,)"""
-    return jnp.zeros_like(pose)
+    return jnp.zeros(tangent_size(pose), position(pose).dtype)
 
 
-def place(pose: jax.Array, points: jax.Array) -> jax.Array:
+def position(pose: Pose) -> jax.Array:
+    """The coordinates of the pose that are not a rotation matrix. -> (d,)"""
+    return pose.translation if isinstance(pose, SE3) else pose
+
+
+def pose_units(pose: Pose, declared: tuple[int, ...] | None) -> tuple[int, ...]:
+    """1 = length, 0 = angle, for every tangent coordinate; undeclared means all lengths."""
+    if isinstance(pose, SE3):
+        return (1, 1, 1, 0, 0, 0)
+    return (1,) * pose.shape[0] if declared is None else declared
+
+
+def place(pose: Pose, points: jax.Array) -> jax.Array:
     """Platform points (k, d) from the platform frame into the base frame. -> (k, d)"""
     count, dimension = points.shape
+    if isinstance(pose, SE3):
+        return pose.translation + points @ pose.rotation.T
     if pose.shape == (dimension,):
         return pose + points
     if pose.shape == (3,) and dimension == 2:
@@ -32,6 +61,6 @@ def place(pose: jax.Array, points: jax.Array) -> jax.Array:
     raise ValueError(f"a pose of shape {pose.shape} cannot carry points of shape {(count, dimension)}")
 
 
-def place_jacobian(pose: jax.Array, points: jax.Array) -> jax.Array:
+def place_jacobian(pose: Pose, points: jax.Array) -> jax.Array:
     """Velocity of every placed point per unit twist: the rigid-body map. -> (k, d, n)"""
     return jax.jacfwd(lambda twist: place(retract(pose, twist), points))(tangent_zero(pose))

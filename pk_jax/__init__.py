@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from pk_jax.design.optimize import optimize_design as optimize_design
     from pk_jax.design.variables import DesignSpace as DesignSpace
     from pk_jax.design.variables import design_space as design_space
+    from pk_jax.files.mechanism_file import load_mechanism as load_mechanism
+    from pk_jax.files.mechanism_file import save_mechanism as save_mechanism
+    from pk_jax.geometry.se3 import SE3 as SE3
     from pk_jax.kinematics.forward import ForwardKinematics as ForwardKinematics
     from pk_jax.kinematics.forward import forward_kinematics as forward_kinematics
     from pk_jax.kinematics.inverse import InverseKinematics as InverseKinematics
@@ -33,6 +36,7 @@ if TYPE_CHECKING:
     from pk_jax.mechanisms.base import Skeleton as Skeleton
     from pk_jax.mechanisms.catalogue import catalogued as catalogued
     from pk_jax.mechanisms.five_bar import FiveBar as FiveBar
+    from pk_jax.mechanisms.stewart import Stewart as Stewart
     from pk_jax.mechanisms.two_rpr import TwoRPR as TwoRPR
     from pk_jax.precision import enable_x64 as enable_x64
     from pk_jax.status import Status as Status
@@ -61,6 +65,11 @@ _NAMES = {
         "DesignSpace",
         "design_space",
     ),
+    "pk_jax.files.mechanism_file": (
+        "load_mechanism",
+        "save_mechanism",
+    ),
+    "pk_jax.geometry.se3": ("SE3",),
     "pk_jax.kinematics.forward": (
         "ForwardKinematics",
         "forward_kinematics",
@@ -82,6 +91,7 @@ _NAMES = {
     ),
     "pk_jax.mechanisms.catalogue": ("catalogued",),
     "pk_jax.mechanisms.five_bar": ("FiveBar",),
+    "pk_jax.mechanisms.stewart": ("Stewart",),
     "pk_jax.mechanisms.two_rpr": ("TwoRPR",),
     "pk_jax.precision": ("enable_x64",),
     "pk_jax.status": ("Status",),

@@ -6,6 +6,7 @@ Shapes are always checked. Values are checked only where they are known, that is
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import jax
@@ -18,20 +19,37 @@ def is_concrete(*trees: Any) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
+def known_values() -> contextlib.AbstractContextManager:
+    """Within it, what is computed from known values is known too, also inside of a `jit`.
+
+    Outside of one it does nothing: `ensure_compile_time_eval` runs jitted functions op by op.
+    """
+    is_staged = isinstance(jnp.zeros(()), jax.core.Tracer)
+    return jax.ensure_compile_time_eval() if is_staged else contextlib.nullcontext()
+
+
 def real_array(name: str, value: Any) -> jax.Array:
     """`value` as a floating-point array. Floats keep their precision, integers become floats."""
     if isinstance(value, jax.core.Tracer):
-        dtype = value.dtype
-    else:
-        try:
-            dtype = np.asarray(value).dtype
-        except ValueError:  # ragged nested lists
-            raise ValueError(f"{name} must be a number or a regular array, got {value!r}") from None
-    if jnp.issubdtype(dtype, jnp.floating):
-        return jnp.asarray(value)
-    if jnp.issubdtype(dtype, jnp.integer):
-        return jnp.asarray(value, dtype=jnp.result_type(float))
-    raise ValueError(f"{name} must be real numbers, got {_short(value)} ({dtype})")
+        if jnp.issubdtype(value.dtype, jnp.floating):
+            return value
+        if jnp.issubdtype(value.dtype, jnp.integer):
+            return value.astype(jnp.result_type(float))
+        raise ValueError(f"{name} must be real numbers, got {value.dtype}")
+    return jnp.asarray(real_numpy(name, value))
+
+
+def real_numpy(name: str, value: Any) -> np.ndarray:
+    """The same as a NumPy array, for values that are known."""
+    try:
+        array = np.asarray(value)
+    except ValueError:  # ragged nested lists
+        raise ValueError(f"{name} must be a number or a regular array, got {_short(repr(value))}") from None
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    if np.issubdtype(array.dtype, np.integer):
+        return array.astype(jnp.result_type(float))
+    raise ValueError(f"{name} must be real numbers, got {_short(value)} ({array.dtype})")
 
 
 def has_shape(name: str, value: jax.Array, shape: tuple[int | None, ...]) -> None:

@@ -7,11 +7,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from pk_jax.geometry import safe
-from pk_jax.kinematics.batching import over_rows, rows_of
-from pk_jax.kinematics.inverse import SINGULAR_BELOW, branch_rows, inverse_kinematics
-from pk_jax.kinematics.jacobian import ScaledJacobians, scaled_jacobians, units
+from pk_jax.geometry.poses import pose_units
+from pk_jax.kinematics.batching import home_shapes, over_rows, rows_of, where
+from pk_jax.kinematics.inverse import branch_rows, inverse_kinematics
+from pk_jax.kinematics.jacobian import SINGULAR_BELOW, ScaledJacobians, scaled_jacobians
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
 
@@ -39,13 +41,12 @@ def local_indices(mech: Mechanism, pose: Any, branch: Any = None) -> LocalIndice
     point, the derivative of the isotropy is the mean of the directional ones, 0.
     """
     require_mechanism("local_indices", mech)
-    home_pose, home_joints = jax.eval_shape(mech.home)
-    pose = rows_of("pose", pose, home_pose)
-    batched = (pose.ndim > home_pose.ndim,)
+    home_pose, home_joints = home_shapes(mech)
+    pose, many = rows_of("pose", pose, home_pose)
     if branch is None:
-        return _local(mech, (pose,), batched)
-    branch = branch_rows(branch, home_joints)
-    return _local(mech, (pose, branch), (*batched, branch.ndim > home_joints.ndim))
+        return _local(mech, (pose,), (many,))
+    branch, branches = branch_rows(branch, home_joints)
+    return _local(mech, (pose, branch), (many, branches))
 
 
 @partial(jax.jit, static_argnums=2)
@@ -57,7 +58,7 @@ def _one(mech: Mechanism, pose: jax.Array, branch: jax.Array | None = None) -> L
     solved = inverse_kinematics(mech, pose, branch)
     is_ok = solved.status == Status.OK
     home_pose, home_joints = mech.home()  # lost rows work at home and are masked after
-    pose = jnp.where(is_ok, pose, home_pose)
+    pose = where(is_ok, pose, home_pose)
     joints = jnp.where(is_ok, solved.joints, home_joints)
     isotropy, resistivity = indices_at(mech, pose, joints)
     jacobian = jax.lax.stop_gradient(scaled_jacobians(mech, pose, joints).pose)
@@ -74,8 +75,8 @@ def indices_at(mech: Mechanism, pose: jax.Array, joints: jax.Array) -> tuple[jax
     jacobians = scaled_jacobians(mech, pose, joints)
     isotropy, resistivity = indices_of(jacobians)
     # det J has the units of the pose over those of the joints
-    power = jnp.sum(units(mech.pose_units, pose.shape[0], pose.dtype))
-    power = power - pose.shape[0] * jnp.mean(units(mech.joint_units, joints.shape[0], pose.dtype))
+    of_pose = pose_units(pose, mech.pose_units)
+    power = sum(of_pose) - len(of_pose) * np.mean(mech.joint_units or (1,) * joints.shape[0])
     return isotropy, resistivity / mech.length() ** power
 
 

@@ -6,10 +6,11 @@ import contextlib
 import fcntl
 import json
 import os
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+from pk_jax.files.atomic import write_atomically
 
 
 class RunFolder:
@@ -19,20 +20,9 @@ class RunFolder:
         self.path = path
 
     def write(self, name: str, content: bytes) -> Path:
-        """Write a file whole: into a temporary one beside it, then in one rename."""
+        """Write a file whole, see `write_atomically`."""
         target = self.path / name
-        handle, temporary = tempfile.mkstemp(prefix=f".{name}.", suffix=".part", dir=self.path)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(temporary, 0o666 & ~_umask())
-            os.replace(temporary, target)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
-            raise
+        write_atomically(target, content)
         return target
 
     def write_text(self, name: str, content: str) -> Path:
@@ -81,9 +71,3 @@ def _remove_empty(folders: list[Path]) -> None:
     for folder in folders:
         with contextlib.suppress(OSError):
             folder.rmdir()
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

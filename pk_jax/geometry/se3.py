@@ -86,8 +86,14 @@ def _check_rotations(rotation: np.ndarray) -> None:
         off = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max(axis=(-2, -1))
     finite = np.isfinite(rotation).all(axis=(-2, -1))
     for wrong, what in (
-        (finite & ~(off <= ORTHONORMAL_TO), "must be orthonormal: rotation @ rotation.T is off the identity by"),
-        (finite & (np.linalg.det(np.where(finite[..., None, None], rotation, np.eye(3))) < 0), "is a reflection:"),
+        (
+            finite & ~(off <= ORTHONORMAL_TO),
+            "must be orthonormal: rotation @ rotation.T is off the identity by",
+        ),
+        (
+            finite & (np.linalg.det(np.where(finite[..., None, None], rotation, np.eye(3))) < 0),
+            "is a reflection:",
+        ),
     ):
         if np.any(wrong):
             row = tuple(int(i) for i in np.argwhere(np.atleast_1d(wrong))[0]) if wrong.ndim else ()

@@ -3,36 +3,79 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from pk_jax import checks
+from pk_jax.geometry.se3 import SE3
+from pk_jax.mechanisms.base import Mechanism
 
 
-def rows_of(name: str, value: Any, one: jax.Array) -> jax.Array:
-    """`value` as an array shaped like `one`, or with one leading batch axis more."""
-    array = checks.real_array(name, value).astype(one.dtype)
+def home_shapes(mech: Mechanism) -> tuple[Any, jax.ShapeDtypeStruct]:
+    """Shapes and dtypes of a pose and of the joints."""
+    leaves, tree = jax.tree.flatten(mech)
+    return _home_shapes(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves))
+
+
+@lru_cache(maxsize=256)
+def _home_shapes(tree: Any, leaves: tuple) -> tuple[Any, jax.ShapeDtypeStruct]:
+    mech = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves])
+    return jax.eval_shape(lambda mech: mech.home(), mech)
+
+
+def rows_of(name: str, value: Any, one: Any, *, numpy: bool = False) -> tuple[Any, bool]:
+    """`value` with the leaves of `one`, or with one leading batch axis more; and whether it has that axis."""
+    if isinstance(one, SE3):
+        if not isinstance(value, SE3):
+            raise ValueError(f"{name} must be a pk_jax.SE3, got {type(value).__name__}")
+        rows = [
+            rows_of(f"{name}.{part}", getattr(value, part), getattr(one, part), numpy=numpy)
+            for part in _PARTS
+        ]
+        return jax.tree.unflatten(jax.tree.structure(one), [row for row, _ in rows]), rows[0][1]
+    if isinstance(value, SE3):
+        raise ValueError(f"{name} must be an array of shape {one.shape}, got an SE3")
+    array = (checks.real_numpy if numpy else checks.real_array)(name, value).astype(one.dtype)
     if array.ndim == one.ndim + 1:
         checks.has_shape(name, array, (None, *one.shape))
     elif array.ndim == one.ndim:
         checks.has_shape(name, array, one.shape)
     else:
         raise ValueError(f"{name} must have shape {one.shape} or (batch, ...), got {array.shape}")
-    return array
+    return array, array.ndim > one.ndim
+
+
+_PARTS = ("translation", "rotation")
 
 
 def over_rows(function: Callable, arguments: tuple, are_batched: tuple[bool, ...]) -> Any:
     """`function(*arguments)`, vmapped over those arguments that are batched."""
     if not any(are_batched):
         return function(*arguments)
-    sizes = {a.shape[0] for a, batched in zip(arguments, are_batched, strict=True) if batched}
-    if len(sizes) != 1:
-        raise ValueError(f"batched arguments must have the same number of rows, got {sorted(sizes)}")
+    same_size(arguments, are_batched)
     return jax.vmap(function, in_axes=tuple(0 if batched else None for batched in are_batched))(*arguments)
 
 
-def all_finite(*arrays: jax.Array) -> jax.Array:
+def same_size(arguments: tuple, are_batched: tuple[bool, ...]) -> int:
+    """The number of rows of all batched arguments; ValueError where they differ."""
+    sizes = {
+        jax.tree.leaves(a)[0].shape[0] for a, batched in zip(arguments, are_batched, strict=True) if batched
+    }
+    if len(sizes) != 1:
+        raise ValueError(f"batched arguments must have the same number of rows, got {sorted(sizes)}")
+    return sizes.pop()
+
+
+def all_finite(*trees: Any) -> jax.Array:
     """() True where no entry is NaN or infinite."""
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(a)) for a in arrays]))
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(trees)]))
+
+
+def where(condition: jax.Array, chosen: Any, other: Any) -> Any:
+    """`jnp.where` for one row's pose of any kind; `other` may be one number."""
+    if isinstance(other, float | int):
+        return jax.tree.map(lambda leaf: jnp.where(condition, leaf, other), chosen)
+    return jax.tree.map(lambda *leaves: jnp.where(condition, *leaves), chosen, other)

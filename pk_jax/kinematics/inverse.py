@@ -12,13 +12,11 @@ from jax import lax
 
 from pk_jax import checks
 from pk_jax.kinematics import newton
-from pk_jax.kinematics.batching import all_finite, over_rows, rows_of
+from pk_jax.kinematics.batching import all_finite, home_shapes, over_rows, rows_of, where
 from pk_jax.kinematics.closure import is_closed, joint_scale
-from pk_jax.kinematics.jacobian import joint_jacobian, scaled_jacobians
+from pk_jax.kinematics.jacobian import SINGULAR_BELOW, joint_jacobian, scaled_jacobians
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
-
-SINGULAR_BELOW = 1e-6  # sine of an angle; a reach limit itself is only known to sqrt(eps)
 
 
 class InverseKinematics(NamedTuple):
@@ -45,21 +43,20 @@ def inverse_kinematics(
     The derivative of a row that is not OK is zero.
     """
     require_mechanism("inverse_kinematics", mech)
-    home_pose, home_joints = jax.eval_shape(mech.home)
-    pose = rows_of("pose", pose, home_pose)
-    batched = (pose.ndim > home_pose.ndim,)
+    home_pose, home_joints = home_shapes(mech)
+    pose, many = rows_of("pose", pose, home_pose)
     if branch is None:
-        return _solve(mech, (pose,), free, batched)
-    branch = branch_rows(branch, home_joints)
-    return _solve(mech, (pose, branch), free, (*batched, branch.ndim > home_joints.ndim))
+        return _solve(mech, (pose,), free, (many,))
+    branch, branches = branch_rows(branch, home_joints)
+    return _solve(mech, (pose, branch), free, (many, branches))
 
 
-def branch_rows(branch: Any, home_joints: jax.Array) -> jax.Array:
+def branch_rows(branch: Any, home_joints: jax.Array) -> tuple[jax.Array, bool]:
     """Signs of a working mode, (m,) or (batch, m); ValueError where they are not signs."""
-    array = rows_of("branch", branch, home_joints)
+    array, many = rows_of("branch", branch, home_joints)
     if checks.is_concrete(array) and not np.all(np.abs(np.asarray(array)) == 1):
         raise ValueError(f"branch must hold only +1 and -1, got {np.asarray(array).tolist()}")
-    return array
+    return array, many
 
 
 @partial(jax.jit, static_argnums=3)
@@ -71,7 +68,7 @@ def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = No
     home_pose, home_joints = mech.home()
     is_given = all_finite(pose)
     is_mode = True if branch is None else jnp.all(jnp.abs(branch) == 1)
-    pose = jnp.where(is_given, pose, home_pose)  # lost rows work on the home pose and are masked after
+    pose = where(is_given, pose, home_pose)  # lost rows work on the home pose and are masked after
     if hasattr(mech, "inverse"):
         joints_at = lambda pose: mech.inverse(pose, branch, free=free)
         failed = Status.UNREACHABLE
@@ -81,7 +78,7 @@ def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = No
 
     found = lax.stop_gradient(joints_at(lax.stop_gradient(pose)))
     is_real = all_finite(found)
-    at = lax.stop_gradient(jnp.where(is_real, pose, home_pose))
+    at = lax.stop_gradient(where(is_real, pose, home_pose))
     jacobians = scaled_jacobians(lax.stop_gradient(mech), at, jnp.where(is_real, found, home_joints))
     sigma = jnp.linalg.svd(jacobians.joints, compute_uv=False)[-1]
     status = jnp.where(sigma < SINGULAR_BELOW, Status.SINGULAR, Status.OK)
@@ -90,7 +87,7 @@ def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = No
     status = jnp.where(is_mode, status, Status.BAD_INPUT).astype(jnp.int32)
 
     is_ok = status == Status.OK
-    joints = joints_at(jnp.where(is_ok, pose, home_pose))  # what is differentiated never sees a limit
+    joints = joints_at(where(is_ok, pose, home_pose))  # what is differentiated never sees a limit
     return InverseKinematics(jnp.where(is_ok, joints, jnp.nan), status, jnp.where(is_given, found, jnp.nan))
 
 

@@ -7,7 +7,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from pk_jax.geometry.poses import pose_units
 from pk_jax.mechanisms.base import Mechanism
+
+SINGULAR_BELOW = 1e-6  # sine of an angle; a reach limit itself is only known to sqrt(eps)
 
 
 @jax.jit
@@ -49,13 +52,13 @@ def scaled_jacobians(mech: Mechanism, pose: Any, joints: jax.Array) -> ScaledJac
     """
     a = pose_jacobian(mech, pose, joints)
     b = joint_jacobian(mech, pose, joints)
-    a = a * mech.length() ** units(mech.pose_units, a.shape[1], a.dtype)
-    b = b * mech.length() ** units(mech.joint_units, b.shape[1], b.dtype)
+    a = a * mech.length() ** units(pose_units(pose, mech.pose_units), a.dtype)
+    b = b * mech.length() ** units(mech.joint_units or (1,) * b.shape[1], b.dtype)
     size = jnp.linalg.norm(a, axis=1, keepdims=True)
     size = jnp.where(size > 0, size, 1)
     return ScaledJacobians(a / size, b / size)
 
 
-def units(declared: tuple[int, ...] | None, count: int, dtype: Any) -> jax.Array:
-    """Powers of length of `count` coordinates; undeclared means all lengths. -> (count,)"""
-    return jnp.asarray(declared if declared is not None else (1,) * count, dtype)
+def units(powers: tuple[int, ...], dtype: Any) -> jax.Array:
+    """Powers of length of the coordinates: 1 = length, 0 = angle."""
+    return jnp.asarray(powers, dtype)

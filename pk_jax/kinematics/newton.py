@@ -41,12 +41,14 @@ def solve(
     *,
     scale: jax.Array,
     steps: int = 100,
+    is_needed: jax.Array | bool = True,
 ) -> Solution:
     """Minimize |F|^2 from `start` by Levenberg-Marquardt that becomes Newton near a root.
 
     linearize:  point -> F (c,) and its tangent Jacobian (c, n), c >= n
     retract:    (point, tangent increment) -> point
     scale:      (n,) natural size of each tangent coordinate: a step is at most 0.5 of it
+    is_needed:  False: no step is taken
 
     A step that does not reduce |F| is refused and the damping grows; an accepted one divides it
     by ten, and below 1e-6 it is zero, so that convergence at a regular root is quadratic. The
@@ -58,7 +60,8 @@ def solve(
     count = jnp.zeros((), jnp.int32)
 
     def is_running(state: _State) -> jax.Array:
-        return (state.small_steps < 2) & (state.steps < steps) & jnp.all(jnp.isfinite(state.value))
+        is_good = jnp.all(jnp.isfinite(state.value)) & is_needed
+        return (state.small_steps < 2) & (state.steps < steps) & is_good
 
     def advance(state: _State) -> _State:
         scaled = state.jacobian * scale

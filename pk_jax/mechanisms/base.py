@@ -40,7 +40,9 @@ class Mechanism(abc.ABC):
     """
 
     joint_units: ClassVar[tuple[int, ...] | None] = None  # 1 = length, 0 = angle; None = all lengths
-    pose_units: ClassVar[tuple[int, ...] | None] = None  # the same for the tangent of the pose
+    pose_units: ClassVar[tuple[int, ...] | None] = None  # the same for the tangent of an array pose
+    joints_are_distances: ClassVar[bool] = False  # joints that are not positive make no sense
+    actuated_rows: ClassVar[int | None] = None  # the first so many equations carry force; None = all
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -67,7 +69,7 @@ class Mechanism(abc.ABC):
                 object.__setattr__(self, field.name, array)
         self.check_shapes()
         if checks.is_concrete(self):
-            with jax.ensure_compile_time_eval():  # known values stay known inside a jit
+            with checks.known_values():
                 for field in dataclasses.fields(self):
                     if (value := getattr(self, field.name)) is not None:
                         checks.is_finite(f"{type(self).__name__}.{field.name}", value)

@@ -58,12 +58,12 @@ class Stewart(LegMechanism):
         at 30 degrees + base_half_angle to the platform joint at 90 degrees - platform_half_angle, and on
         counterclockwise.
         """
-        leg = jnp.arange(LEGS)
-        pair, side = jnp.deg2rad(30.0 + 120.0 * ((leg + 1) // 2)), jnp.where(leg % 2 == 0, 1.0, -1.0)
-        on_base = pair + side * base_half_angle
-        on_platform = jnp.deg2rad(90.0 + 120.0 * (leg // 2)) - side * platform_half_angle
-        circle = lambda radius, angle: radius * jnp.stack([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=1)
-        return cls(base=circle(base_radius, on_base), platform=circle(platform_radius, on_platform))
+        leg = np.arange(LEGS)
+        middles = np.deg2rad(30.0 + 120.0 * ((leg + 1) // 2)), np.deg2rad(90.0 + 120.0 * (leg // 2))
+        side = np.where(leg % 2 == 0, 1.0, -1.0)
+        angles = middles[0] + side * base_half_angle, middles[1] - side * platform_half_angle
+        base, platform = (np.stack([np.cos(a), np.sin(a), 0 * a], axis=1) for a in angles)
+        return cls(base=base_radius * base, platform=platform_radius * platform)
 
     def check_shapes(self) -> None:
         checks.has_shape("Stewart.base", self.base, (None, 3))
@@ -81,7 +81,8 @@ class Stewart(LegMechanism):
 
     def check_values(self) -> None:
         sizes = [
-            _check_points(f"Stewart.{name}", np.asarray(getattr(self, name))[:LEGS]) for name in ("base", "platform")
+            _check_points(f"Stewart.{name}", np.asarray(getattr(self, name))[:LEGS])
+            for name in ("base", "platform")
         ]
         ends = np.concatenate([np.asarray(self.base)[:LEGS], np.asarray(self.platform)[:LEGS]], axis=1)
         for i in range(LEGS):
@@ -159,7 +160,9 @@ class Stewart(LegMechanism):
     def skeleton(self, pose: SE3, joints: jax.Array) -> Skeleton:
         rows = self.base.shape[0]
         points = jnp.concatenate([self.base, place(pose, self.platform)])
-        rims = [[start + i for i in _around(joints)] for start, joints in ((0, self.base), (rows, self.platform))]
+        rims = [
+            [start + i for i in _around(joints)] for start, joints in ((0, self.base), (rows, self.platform))
+        ]
         legs = tuple((i, i + rows) for i in range(rows))
         outline = tuple((rim[i - 1], rim[i]) for rim in rims for i in range(LEGS))
         return Skeleton(points, legs + outline, ground=tuple(range(rows)))
@@ -195,25 +198,31 @@ def _best_home(mech: Stewart) -> tuple[SE3, jax.Array]:
     up = _normal(base - below)
     level = _turn_onto(_normal(platform - above), up)
 
-    def candidate(yaw, height):
-        rotation = rotations.from_rotation_vector(yaw * up) @ level
+    def candidate(yaw, height, tilt):
+        lean = rotations.from_rotation_vector(tilt * (level @ jnp.asarray([0.8, 0.6, 0.0], base.dtype)))
+        rotation = lean @ rotations.from_rotation_vector(yaw * up) @ level
         if mech.stroke is not None:  # the mean of the squared lengths is that of the middle of the strokes
             apart = (platform - above) @ rotation.T - (base - below)
-            middle = jnp.mean(mech.stroke, axis=-1)
-            squared = jnp.mean(middle**2) - jnp.mean(jnp.sum(apart**2, axis=1))
+            squared = jnp.mean(jnp.mean(mech.stroke, axis=-1) ** 2) - jnp.mean(jnp.sum(apart**2, axis=1))
             rise = jnp.sqrt(jnp.maximum(squared, (0.1 * radius) ** 2))
         else:
             rise = height * jnp.maximum(radius, mech.length())
         pose = SE3(below + rise * up - rotation @ above, rotation)
         return pose, _clearance(mech, pose)
 
-    yaws = 2 * jnp.pi / 24 * jnp.arange(24)
-    heights = jnp.asarray([1.0, 0.7, 1.4, 2.0, 0.5])
-    yaws, heights = (grid.ravel().astype(base.dtype) for grid in jnp.meshgrid(yaws, heights, indexing="ij"))
-    poses, clearances = jax.vmap(candidate)(yaws, heights)
-    # the first candidate, unturned and as high as the base is wide, unless another is far better
+    poses, clearances = jax.vmap(candidate)(*jnp.asarray(_CANDIDATES, base.dtype).T)
+    # the first candidate, level, unturned and as high as the base is wide, unless another is far better
     good = jnp.argmax(clearances > jnp.max(clearances) / 2)
     return jax.tree.map(lambda leaf: leaf[good], poses), clearances[good]
+
+
+# yaw in rad, height over the greater radius, tilt in rad
+_CANDIDATES = [
+    (np.deg2rad(15 * turn), height, tilt)
+    for tilt in (0.0, 0.4, -0.4)
+    for turn in range(24)
+    for height in (1.0, 0.7, 1.4, 2.0, 0.5)
+]
 
 
 def _clearance(mech: Stewart, pose: SE3) -> jax.Array:

@@ -24,6 +24,7 @@ class TwoRPR(LegMechanism):
     l_max: jax.Array
 
     joint_units = (1, 1)
+    joints_are_distances = True
 
     def check_shapes(self) -> None:
         for name in ("half_base", "l_min", "l_max"):

@@ -1,0 +1,255 @@
+"""Newton and Gauss-Newton for many rows at once, and the verdict on where they ended, on lanes.
+
+It sees a mechanism through `linearize`, `residual` and `retract` only, each evaluated entry by entry.
+Rows do not see one another: a row that has converged is frozen, so that its bits don't depend on its
+neighbours.
+"""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from pk_jax.geometry.poses import pose_units, retract
+from pk_jax.kinematics import elimination
+from pk_jax.kinematics.closure import closed_to, closure, pose_scale
+from pk_jax.kinematics.elimination import Matrix, Order
+from pk_jax.kinematics.jacobian import SINGULAR_BELOW, units
+from pk_jax.kinematics.lanes import Entries, Lane, entrywise, is_entries, over, split, times, total
+from pk_jax.mechanisms.base import Mechanism
+from pk_jax.status import Status
+
+STEPS = 10
+LONGEST_STEP = 0.5  # of the natural size of each coordinate
+INCONSISTENT_ABOVE = 1e-6  # of the size of each closure equation, for redundant mechanisms
+
+
+class Ended(NamedTuple):
+    """Where the iteration of every row ended."""
+
+    pose: Any  # of Entries
+    is_stationary: Lane  # the last step was so small that the next is below roundoff
+    steps: Lane
+
+
+class Judged(NamedTuple):
+    """What holds at a pose, from the equations evaluated afresh there."""
+
+    residual: Lane  # |F|
+    is_closed: Lane  # square: F is zero to roundoff; redundant: the equations agree to 1e-6
+    sigma_min: Lane  # at most the least singular value of A without units, at least it over sqrt(n)
+    sign: Lane  # of det A in the order of pivots; 0 where the actuated equations are redundant
+
+
+class Attempt(NamedTuple):
+    """One row: where Newton ended and what that is worth."""
+
+    pose: Any  # of Entries
+    status: Lane
+    residual: Lane
+    steps: Lane
+    sigma_min: Lane
+    det_sign: Lane
+
+
+def attempt(
+    mech: Any,
+    joints: Entries,
+    start: Any,
+    home: Any,
+    order: Order | None,
+    *,
+    kind: type[Mechanism],
+    is_home: bool,
+) -> Attempt:
+    """Newton from `start` and the verdict, all arguments made of `Entries`. STALLED rows deserve more effort.
+
+    home:     `Home` of `Entries`
+    is_home:  the start is the home pose, so that the first step's inverse is known
+    """
+    is_given = reduce(jnp.logical_and, [jnp.isfinite(q) for q in joints.items])
+    if kind.joints_are_distances:
+        is_given = reduce(jnp.logical_and, [q > 0 for q in joints.items], is_given)
+    if not is_home:
+        finite = [jnp.isfinite(x) for leaf in jax.tree.leaves(start, is_leaf=is_entries) for x in leaf.items]
+        is_given = reduce(jnp.logical_and, finite, is_given)
+        start = _where(is_given, start, home.pose)
+    joints = _where(is_given, joints, home.joints)  # lost rows work at home and are masked after
+    ended = iterate(mech, joints, start, order, home.first.rows() if is_home else None, home.first.shape[1])
+    judged = judge(mech, joints, ended.pose, order, kind.actuated_rows)
+    is_square = home.first.shape[0] == home.first.shape[1]
+    det_sign = judged.sign * home.sign.items[0]
+    side = det_sign
+    if is_square and not is_home:
+        side = judged.sign * start_sign(mech, joints, start, order, None)
+    status = verdict(judged, ended.is_stationary, side, is_square=is_square)
+    status = jnp.where(is_given, status, Status.BAD_INPUT)
+    return Attempt(ended.pose, status, judged.residual, ended.steps, judged.sigma_min, det_sign)
+
+
+def verdict(judged: Judged, is_stationary: Lane, side: Lane, *, is_square: bool) -> Lane:
+    """Status of a row; `side` is the sign of det A over that at the start."""
+    if is_square:
+        status = jnp.where(judged.is_closed, Status.OK, Status.STALLED)
+        status = jnp.where(judged.is_closed & (side < 0), Status.OTHER_MODE, status)
+    else:
+        status = jnp.where(judged.is_closed, Status.OK, Status.INCONSISTENT)
+        status = jnp.where(is_stationary, status, Status.STALLED)
+    is_solved = judged.is_closed & (is_square | is_stationary)
+    return jnp.where(is_solved & (judged.sigma_min < SINGULAR_BELOW), Status.SINGULAR, status)
+
+
+class Home(NamedTuple):
+    """What is known of a mechanism before any row is seen."""
+
+    pose: Any
+    joints: jax.Array  # (m,)
+    first: jax.Array  # (n, c) inverse of A
+    sign: jax.Array  # () of det A in the order of pivots; 0 where the actuated equations are redundant
+
+
+def home_of(mech: Mechanism, order: Order | None) -> Home:
+    """The home configuration and the inverse of A there."""
+    pose, joints = lax.stop_gradient(mech.home())
+    jacobian = lax.stop_gradient(mech).linearize(pose, joints)[1]
+    sign = jnp.zeros((), jacobian.dtype)
+    if order is not None:
+        sign = jnp.sign(elimination.factor(split(jacobian).rows()[: mech.actuated_rows], order).det())
+    return Home(pose, joints, jnp.linalg.pinv(jacobian), sign)
+
+
+def order_at_home(mech: Mechanism) -> Order | None:
+    """The order of pivots; None where the actuated equations are redundant."""
+    pose, joints = mech.home()
+    jacobian = lax.stop_gradient(mech.linearize(pose, joints)[1])[: mech.actuated_rows]
+    return elimination.pivot_order(jacobian) if jacobian.shape[0] == jacobian.shape[1] else None
+
+
+def iterate(
+    mech: Any, joints: Entries, start: Any, order: Order | None, first: Matrix | None, equations: int
+) -> Ended:
+    """At most `STEPS` clipped Newton steps from `start`, all arguments made of `Entries`.
+
+    order: of the pivots
+    first: inverse of A (n, c) at the start, where it is known; spares the first elimination
+    """
+    like = joints.items[0]
+    scale = entrywise(pose_scale, mech, start).items
+    eps = float(jnp.finfo(like.dtype).eps)
+    # the error after a Newton step d is about d^2; Gauss-Newton is only linear
+    is_square = equations == len(scale)
+    small = eps**0.5 / 4 if is_square else 1024 * eps
+
+    def moved(pose: Any, increment: list[Lane]) -> tuple[Any, Lane]:
+        longest = reduce(jnp.maximum, [jnp.abs(d) / s for d, s in zip(increment, scale, strict=True)])
+        shrink = -LONGEST_STEP / jnp.maximum(longest, LONGEST_STEP)
+        twist = Entries((len(increment),), [times(d, shrink) for d in increment])
+        return entrywise(retract, pose, twist), longest
+
+    pose = start
+    if first is not None:
+        value = entrywise(lambda m, x, q: m.residual(x, q), mech, pose, joints).items
+        step = [total([times(a, f) for a, f in zip(row, value, strict=True)]) for row in first]
+        pose, _ = moved(pose, step)
+    taken = int(first is not None)
+    items, shape = _items(pose, like)
+
+    def is_running(state):
+        return (state[0] < STEPS - taken) & ~jnp.all(state[3])
+
+    def advance(state):
+        k, items, steps, has_stopped, is_stationary = state
+        pose = _pose(items, shape)
+        value, jacobian = entrywise(lambda m, x, q: m.linearize(x, q), mech, pose, joints)
+        pose, longest = moved(pose, _least_squares(jacobian.rows(), value.items, order))
+        items = [jnp.where(has_stopped, *each) for each in zip(items, _items(pose, like)[0], strict=True)]
+        steps = jnp.where(has_stopped, steps, steps + 1)
+        is_stationary = is_stationary | (~has_stopped & (longest < small))
+        return k + 1, items, steps, is_stationary | jnp.isnan(longest), is_stationary
+
+    none, count = jnp.zeros(like.shape, bool), jnp.full(like.shape, taken, jnp.int32)
+    _, items, steps, _, is_stationary = lax.while_loop(is_running, advance, (0, items, count, none, none))
+    return Ended(_pose(items, shape), is_stationary, steps)
+
+
+def judge(mech: Any, joints: Entries, pose: Any, order: Order | None, actuated: int | None) -> Judged:
+    """The equations at `pose`, evaluated afresh, and how far from a singularity it is."""
+    like = joints.items[0]
+    value, jacobian, size, of_pose = entrywise(closure, mech, pose, joints)
+    rows = jacobian.rows()
+    residual = jnp.sqrt(total([times(f, f) for f in value.items]))
+    is_square = len(rows) == len(rows[0])
+    allowed, sizes = (closed_to(like.dtype), size) if is_square else (INCONSISTENT_ABOVE, of_pose)
+    within = [jnp.abs(f) <= allowed * s for f, s in zip(value.items, sizes.items, strict=True)]
+    is_closed = reduce(jnp.logical_and, within)
+
+    factors = None if order is None else elimination.factor(rows[:actuated], order)
+    sign = jnp.zeros_like(like) if factors is None else jnp.sign(factors.det())
+    lengths = entrywise(_column_units, mech, pose).items
+    scaled = [[times(a, u) for a, u in zip(row, lengths, strict=True)] for row in rows]
+    norms = [jnp.sqrt(total([times(a, a) for a in row])) for row in scaled]
+    if is_square:
+        inverse = elimination.inverse(factors)
+        entries = [
+            over(times(a, r), u)
+            for row, u in zip(inverse, lengths, strict=True)
+            for a, r in zip(row, norms, strict=True)
+        ]
+    else:
+        unit = [[over(a, norm) for a in row] for row, norm in zip(scaled, norms, strict=True)]
+        upper, _ = elimination.orthogonalize(unit, [0.0] * len(unit))
+        n = len(upper)
+        columns = [elimination.back_substitute(upper, [float(i == k) for i in range(n)]) for k in range(n)]
+        entries = [item for column in columns for item in column]
+    sigma = 1 / jnp.sqrt(total([times(a, a) for a in entries]))
+    return Judged(residual, is_closed, jnp.where(jnp.isfinite(sigma), sigma, 0), sign)
+
+
+def start_sign(mech: Any, joints: Entries, start: Any, order: Order, actuated: int | None) -> Lane:
+    """Sign of det A at the start, in the order of pivots."""
+    jacobian = entrywise(lambda m, x, q: m.linearize(x, q)[1], mech, start, joints)
+    return jnp.sign(elimination.factor(jacobian.rows()[:actuated], order).det())
+
+
+def _least_squares(rows: Matrix, value: list[Lane], order: Order | None) -> list[Lane]:
+    if len(rows) == len(rows[0]):
+        return elimination.solve(elimination.factor(rows, order), value)
+    return elimination.back_substitute(*elimination.orthogonalize(rows, value))
+
+
+def _column_units(mech: Any, pose: Any) -> jax.Array:
+    powers = units(pose_units(pose, mech.pose_units), mech.length().dtype)
+    return jnp.where(powers > 0, mech.length(), 1)
+
+
+def _where(condition: Lane, chosen: Any, other: Any) -> Any:
+    """`jnp.where`, entry by entry."""
+    choose = lambda a, b: Entries(
+        a.shape, [jnp.where(condition, *each) for each in zip(a.items, b.items, strict=True)]
+    )
+    return jax.tree.map(choose, chosen, other, is_leaf=is_entries)
+
+
+def _items(pose: Any, like: Lane) -> tuple[list[Lane], Any]:
+    """Every entry of a pose as a lane, and what puts them together again."""
+    leaves, tree = jax.tree.flatten(pose, is_leaf=is_entries)
+    items = [
+        jnp.broadcast_to(jnp.asarray(item, like.dtype), like.shape) for leaf in leaves for item in leaf.items
+    ]
+    return items, (tree, [leaf.shape for leaf in leaves])
+
+
+def _pose(items: list[Lane], shape: Any) -> Any:
+    tree, shapes = shape
+    items = iter(items)
+    leaves = []
+    for each in shapes:
+        count = 1
+        for size in each:
+            count *= size
+        leaves.append(Entries(each, [next(items) for _ in range(count)]))
+    return jax.tree.unflatten(tree, leaves)

@@ -1,0 +1,178 @@
+"""Many known rows: blocks of lanes, on all cores, without tracing anything anew for another batch size."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, lru_cache
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from pk_jax import checks
+from pk_jax.kinematics.batching import home_shapes
+from pk_jax.kinematics.compiled import compiled
+from pk_jax.kinematics.elimination import Order
+from pk_jax.kinematics.lane_newton import Attempt, Home, attempt, home_of, order_at_home
+from pk_jax.kinematics.lanes import Entries, split, split_rows
+from pk_jax.mechanisms.base import Mechanism
+
+LANES = 64  # of a chunk on a CPU: its few hundred intermediate values stay in the cache
+BLOCK = 4096  # rows of one call; on an accelerator they are the lanes, all at once
+ON_ACCELERATOR = 1 << 16
+
+
+class Prepared(NamedTuple):
+    """What solving needs of a known mechanism, computed once."""
+
+    home: Home
+    order: Order | None
+    leaves: list[jax.Array]  # of the mechanism and its home
+    tree: Any
+
+
+class Rows(NamedTuple):
+    """NumPy arrays, one entry a row."""
+
+    pose: Any
+    status: np.ndarray
+    residual: np.ndarray
+    steps: np.ndarray
+    sigma_min: np.ndarray
+    det_sign: np.ndarray
+
+
+_prepared: WeakKeyDictionary[Mechanism, Prepared] = WeakKeyDictionary()
+
+
+def prepared(mech: Mechanism) -> Prepared:
+    """Home, its inverse and its order of pivots, kept as long as the mechanism lives."""
+    found = _prepared.get(mech)
+    if found is None:
+        with checks.known_values():
+            order = order_at_home(mech)
+            home = _home(mech, order)
+            leaves, tree = jax.tree.flatten((mech, home))
+            found = _prepared[mech] = Prepared(home, order, [jnp.asarray(leaf) for leaf in leaves], tree)
+    return found
+
+
+_home = jax.jit(home_of, static_argnums=1)
+
+
+def solve(mech: Mechanism, joints: np.ndarray, guess: Any, *, one_guess: bool) -> Rows:
+    """The first attempt at every row. joints (batch, m); guess: None, one pose, or one a row."""
+    ready = prepared(mech)
+    count, dtype = joints.shape[0], joints.dtype
+    start = "home" if guess is None else "one" if one_guess else "rows"
+    block = BLOCK if jax.default_backend() == "cpu" else ON_ACCELERATOR
+    shapes = tuple((leaf.shape, leaf.dtype) for leaf in ready.leaves)
+    program = _program(ready.tree, shapes, ready.order, start, block, joints.shape[1], dtype)
+    pose_leaves, pose_tree = jax.tree.flatten(home_shapes(mech)[0])
+    poses = [np.empty((count, *leaf.shape), dtype) for leaf in pose_leaves]
+    numbers = np.empty((count, len(Rows._fields) - 1), dtype)
+    columns = np.split(
+        np.arange(sum(leaf.size for leaf in pose_leaves)), np.cumsum([p.size for p in pose_leaves])[:-1]
+    )
+    flat_guess = None
+    if guess is not None:
+        rows = (1,) if one_guess else (count,)
+        flat_guess = np.concatenate(
+            [np.asarray(leaf, dtype).reshape(*rows, -1) for leaf in jax.tree.leaves(guess)], 1
+        )
+        flat_guess = flat_guess[0] if one_guess else flat_guess
+
+    def run(first: int) -> None:
+        rows = slice(first, min(first + block, count))
+        size = rows.stop - first
+        given = [jnp.asarray(_padded(joints[rows], block)), jnp.asarray(np.int32(size))]
+        if flat_guess is not None:
+            given.append(jnp.asarray(flat_guess if one_guess else _padded(flat_guess[rows], block)))
+        out = np.asarray(program([*ready.leaves, *given])[0])  # (chunks, values, lanes)
+        out = out[: -(-size // out.shape[2])]
+        for pose, column in zip(poses, columns, strict=True):
+            part = out[:, column[0] : column[-1] + 1].transpose(0, 2, 1)
+            pose[rows] = part.reshape(-1, *pose.shape[1:])[:size]
+        numbers[rows] = out[:, columns[-1][-1] + 1 :].transpose(0, 2, 1).reshape(-1, numbers.shape[1])[:size]
+
+    starts = range(0, count, block)
+    list(_threads().map(run, starts) if len(starts) > 1 else map(run, starts))
+    status, residual, steps, sigma_min, det_sign = numbers.T
+    return Rows(
+        jax.tree.unflatten(pose_tree, poses),
+        status.astype(np.int32),
+        residual,
+        steps.astype(np.int32),
+        sigma_min,
+        det_sign,
+    )
+
+
+@lru_cache(maxsize=64)
+def _program(
+    tree: Any, shapes: tuple, order: Order | None, start: str, block: int, joints: int, dtype: Any
+) -> Callable:
+    """The compiled block: leaves of mechanism and home, joints, number of rows, guess -> (chunks, values, lanes)."""
+    mech, home = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+    lanes = LANES if jax.default_backend() == "cpu" else block
+    size = sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(home.pose))
+    given = [jax.ShapeDtypeStruct((block, joints), dtype), jax.ShapeDtypeStruct((), jnp.int32)]
+    if start != "home":
+        given.append(jax.ShapeDtypeStruct((size,) if start == "one" else (block, size), dtype))
+    kind = type(mech)
+
+    def solve_block(mech, home, joints, count, guess=None):
+        entries, home = jax.tree.map(split, (mech, home))
+
+        def chunk(k, out):
+            at = lambda rows: split_rows(lax.dynamic_slice_in_dim(rows, k * lanes, lanes))
+            begin = home.pose
+            if start != "home":
+                begin = _as_pose(split(guess) if start == "one" else at(guess), home.pose)
+            found = attempt(entries, at(joints), begin, home, order, kind=kind, is_home=start == "home")
+            return lax.dynamic_update_slice_in_dim(out, values_of(found, dtype)[None], k, 0)
+
+        chunks = block // lanes
+        out = jnp.zeros((chunks, size + len(Rows._fields) - 1, lanes), dtype)
+        return lax.fori_loop(0, jnp.minimum((count + lanes - 1) // lanes, chunks), chunk, out)
+
+    return compiled(solve_block, (mech, home, *given))
+
+
+def values_of(found: Attempt, dtype: Any) -> jax.Array:
+    """Everything that an attempt says, as one array of lanes. -> (values, lanes)"""
+    poses = [
+        item
+        for leaf in jax.tree.leaves(found.pose, is_leaf=lambda e: isinstance(e, Entries))
+        for item in leaf.items
+    ]
+    return jnp.stack([item.astype(dtype) for item in (*poses, *found[1:])])
+
+
+def _as_pose(flat: Entries, like: Any) -> Any:
+    """A pose of `Entries` like another, from all its entries in a row."""
+    is_entries = lambda leaf: isinstance(leaf, Entries)
+    leaves, tree = jax.tree.flatten(like, is_leaf=is_entries)
+    items, parts = iter(flat.items), []
+    for leaf in leaves:
+        parts.append(Entries(leaf.shape, [next(items) for _ in leaf.items]))
+    return jax.tree.unflatten(tree, parts)
+
+
+def _padded(rows: np.ndarray, count: int) -> np.ndarray:
+    if len(rows) == count:
+        return rows
+    full = np.empty((count, *rows.shape[1:]), rows.dtype)
+    full[: len(rows)], full[len(rows) :] = rows, rows[-1]
+    return full
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return ThreadPoolExecutor(cores if jax.default_backend() == "cpu" else 1, thread_name_prefix="pk_jax")

@@ -65,9 +65,15 @@ class SE3:
         return jax.tree.map(lambda leaf: leaf[row], self)
 
 
+_KEYS = jax.tree_util.GetAttrKey("translation"), jax.tree_util.GetAttrKey("rotation")
+
+
 def _flatten(pose: SE3):
-    keys = jax.tree_util.GetAttrKey
-    return ((keys("translation"), pose.translation), (keys("rotation"), pose.rotation)), None
+    return (pose.translation, pose.rotation), None
+
+
+def _flatten_with_keys(pose: SE3):
+    return tuple(zip(_KEYS, _flatten(pose)[0], strict=True)), None
 
 
 def _unflatten(_: None, leaves: Any) -> SE3:  # JAX rebuilds with tracers: only callers are checked
@@ -77,7 +83,7 @@ def _unflatten(_: None, leaves: Any) -> SE3:  # JAX rebuilds with tracers: only 
     return pose
 
 
-jax.tree_util.register_pytree_with_keys(SE3, _flatten, _unflatten)
+jax.tree_util.register_pytree_with_keys(SE3, _flatten_with_keys, _unflatten, _flatten)
 
 
 def _check_rotations(rotation: np.ndarray) -> None:

@@ -56,9 +56,9 @@ def forward_kinematics(mech: Mechanism, joints: Any, guess: Any = None) -> Forwa
     function theorem; zero on rows that are not OK.
     """
     require_mechanism("forward_kinematics", mech)
-    home_pose, home_joints = home_shapes(mech)
     if checks.is_concrete((mech, joints, guess)):
-        return _known(mech, joints, guess, home_pose, home_joints)
+        return _known(mech, joints, guess)
+    home_pose, home_joints = home_shapes(mech)
     joints, many = rows_of("joints", joints, home_joints)
     home, order = (None, UNKNOWN) if not checks.is_concrete(mech) else rows.prepared(mech)[:2]
     if guess is None:
@@ -81,8 +81,9 @@ def _solve(mech, home, joints_and_guess, are_batched, order):
 def _one(mech: Mechanism, home: Any, order: Any, joints: jax.Array, guess: Any = None) -> ForwardKinematics:
     fixed, q = lax.stop_gradient((mech, joints))
     if order is UNKNOWN:
-        order = lane_newton.order_at_home(fixed)
-        home = lane_newton.home_of(fixed, order)
+        pose, at_pose, jacobian = lane_newton.at_home(fixed)
+        order = lane_newton.order_of(jacobian, mech.actuated_rows)
+        home = lane_newton.home_from(pose, at_pose, jacobian, order, mech.actuated_rows)
     start = lax.stop_gradient(home.pose if guess is None else guess)
     found = _attempt_one(fixed, home, order, q, None if guess is None else start)
     found = _persist(fixed, home, order, q, start, found, is_home=guess is None)
@@ -163,27 +164,28 @@ def _answer(
 # --- known values: rows in blocks, whatever their number
 
 
-def _known(mech: Mechanism, joints: Any, guess: Any, home_pose: Any, home_joints: Any) -> ForwardKinematics:
+def _known(mech: Mechanism, joints: Any, guess: Any) -> ForwardKinematics:
+    home, order, (home_pose, home_joints) = rows.prepared(mech)[:3]
     joints, many = rows_of("joints", joints, home_joints, numpy=True)
     guess, guesses = (None, False) if guess is None else rows_of("guess", guess, home_pose, numpy=True)
-    home, order = rows.prepared(mech)[:2]
     if not (many or guesses):
         found = _one_known(mech, home, joints, guess, order)
-        if found.status == Status.STALLED:
-            batch = lambda tree: jax.tree.map(lambda leaf: np.asarray(leaf)[None], tree)
-            found = _again(mech, home, joints[None], batch(guess), batch(found), order)
-            found = jax.tree.map(lambda leaf: leaf[0], found)
-        return jax.tree.map(jnp.asarray, found)
+        if int(found.status) != Status.STALLED:
+            return found
+        joints, guess, found = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (joints, guess, found))
+        found = _again(mech, home, joints, guess, found, order)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), found)
     if many and guesses:
         same_size((joints, guess), (True, True))
     elif guesses:
         joints = np.broadcast_to(joints, (jax.tree.leaves(guess)[0].shape[0], *joints.shape))
     solved = rows.solve(mech, joints, guess, one_guess=not guesses)
-    bad, wrong = solved.status == Status.BAD_INPUT, solved.status != Status.OK
-    candidate = _blanked(solved.pose, bad)
-    numbers = _blanked((solved.residual, solved.sigma_min, solved.det_sign), bad)
-    found = ForwardKinematics(
-        _blanked(solved.pose, wrong), solved.status, numbers[0], solved.steps, *numbers[1:], candidate
+    is_bad, is_wrong = solved.status == Status.BAD_INPUT, solved.status != Status.OK
+    found = ForwardKinematics(_blanked(solved.pose, is_wrong), *solved[1:], _blanked(solved.pose, is_bad))
+    found = found._replace(
+        residual=_blanked(solved.residual, is_bad),
+        sigma_min=_blanked(solved.sigma_min, is_bad),
+        det_sign=_blanked(solved.det_sign, is_bad),
     )
     if np.any(solved.status == Status.STALLED):
         each = (
@@ -192,7 +194,7 @@ def _known(mech: Mechanism, joints: Any, guess: Any, home_pose: Any, home_joints
             else jax.tree.map(lambda leaf: _repeated(leaf, len(joints)), guess)
         )
         found = _again(mech, home, joints, each, found, order)
-    return jax.tree.map(jnp.asarray, found)
+    return jax.device_put(found)  # arrays that are aligned are taken over without a copy
 
 
 @partial(jax.jit, static_argnums=4)

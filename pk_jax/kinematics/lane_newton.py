@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from pk_jax.geometry.poses import pose_units, retract
@@ -112,21 +113,25 @@ class Home(NamedTuple):
     sign: jax.Array  # () of det A in the order of pivots; 0 where the actuated equations are redundant
 
 
-def home_of(mech: Mechanism, order: Order | None) -> Home:
-    """The home configuration and the inverse of A there."""
+def at_home(mech: Mechanism) -> tuple[Any, jax.Array, jax.Array]:
+    """Pose, joints and A of the home configuration, without derivatives."""
     pose, joints = lax.stop_gradient(mech.home())
-    jacobian = lax.stop_gradient(mech).linearize(pose, joints)[1]
-    sign = jnp.zeros((), jacobian.dtype)
+    return pose, joints, lax.stop_gradient(mech).linearize(pose, joints)[1]
+
+
+def order_of(jacobian: Any, actuated: int | None) -> Order | None:
+    """The order of pivots at home; None where the actuated equations are redundant."""
+    square = jacobian[:actuated]
+    return elimination.pivot_order(square) if square.shape[0] == square.shape[1] else None
+
+
+def home_from(pose: Any, joints: Any, jacobian: Any, order: Order | None, actuated: int | None) -> Home:
+    """`Home` from what `at_home` gives, for NumPy arrays in NumPy."""
+    xp = np if isinstance(jacobian, np.ndarray) else jnp
+    sign = xp.zeros((), jacobian.dtype)
     if order is not None:
-        sign = jnp.sign(elimination.factor(split(jacobian).rows()[: mech.actuated_rows], order).det())
-    return Home(pose, joints, jnp.linalg.pinv(jacobian), sign)
-
-
-def order_at_home(mech: Mechanism) -> Order | None:
-    """The order of pivots; None where the actuated equations are redundant."""
-    pose, joints = mech.home()
-    jacobian = lax.stop_gradient(mech.linearize(pose, joints)[1])[: mech.actuated_rows]
-    return elimination.pivot_order(jacobian) if jacobian.shape[0] == jacobian.shape[1] else None
+        sign = xp.sign(elimination.factor(split(jacobian).rows()[:actuated], order).det()).astype(jacobian.dtype)
+    return Home(pose, joints, xp.linalg.pinv(jacobian), sign)
 
 
 def iterate(
@@ -138,14 +143,14 @@ def iterate(
     first: inverse of A (n, c) at the start, where it is known; spares the first elimination
     """
     like = joints.items[0]
-    scale = entrywise(pose_scale, mech, start).items
+    per_scale = [1 / scale for scale in entrywise(pose_scale, mech, start).items]
     eps = float(jnp.finfo(like.dtype).eps)
     # the error after a Newton step d is about d^2; Gauss-Newton is only linear
-    is_square = equations == len(scale)
+    is_square = equations == len(per_scale)
     small = eps**0.5 / 4 if is_square else 1024 * eps
 
     def moved(pose: Any, increment: list[Lane]) -> tuple[Any, Lane]:
-        longest = reduce(jnp.maximum, [jnp.abs(d) / s for d, s in zip(increment, scale, strict=True)])
+        longest = reduce(jnp.maximum, [jnp.abs(d) * s for d, s in zip(increment, per_scale, strict=True)])
         shrink = -LONGEST_STEP / jnp.maximum(longest, LONGEST_STEP)
         twist = Entries((len(increment),), [times(d, shrink) for d in increment])
         return entrywise(retract, pose, twist), longest

@@ -18,7 +18,7 @@ from pk_jax import checks
 from pk_jax.kinematics.batching import home_shapes
 from pk_jax.kinematics.compiled import compiled
 from pk_jax.kinematics.elimination import Order
-from pk_jax.kinematics.lane_newton import Attempt, Home, attempt, home_of, order_at_home
+from pk_jax.kinematics.lane_newton import Attempt, Home, at_home, attempt, home_from, order_of
 from pk_jax.kinematics.lanes import Entries, split, split_rows
 from pk_jax.mechanisms.base import Mechanism
 
@@ -32,6 +32,7 @@ class Prepared(NamedTuple):
 
     home: Home
     order: Order | None
+    shapes: tuple[Any, jax.ShapeDtypeStruct]  # of a pose and of the joints
     leaves: list[jax.Array]  # of the mechanism and its home
     tree: Any
 
@@ -55,14 +56,18 @@ def prepared(mech: Mechanism) -> Prepared:
     found = _prepared.get(mech)
     if found is None:
         with checks.known_values():
-            order = order_at_home(mech)
-            home = _home(mech, order)
+            pose, joints, jacobian = jax.tree.map(np.asarray, _at_home(mech))
+            order = order_of(jacobian, mech.actuated_rows)
+            home = home_from(pose, joints, jacobian, order, mech.actuated_rows)
             leaves, tree = jax.tree.flatten((mech, home))
-            found = _prepared[mech] = Prepared(home, order, [jnp.asarray(leaf) for leaf in leaves], tree)
+            leaves = [jnp.asarray(leaf) for leaf in leaves]
+        mech_leaves = len(jax.tree.leaves(mech))
+        home = jax.tree.unflatten(jax.tree.structure(home), leaves[mech_leaves:])
+        found = _prepared[mech] = Prepared(home, order, home_shapes(mech), leaves, tree)
     return found
 
 
-_home = jax.jit(home_of, static_argnums=1)
+_at_home = jax.jit(at_home)
 
 
 def solve(mech: Mechanism, joints: np.ndarray, guess: Any, *, one_guess: bool) -> Rows:
@@ -73,44 +78,35 @@ def solve(mech: Mechanism, joints: np.ndarray, guess: Any, *, one_guess: bool) -
     block = BLOCK if jax.default_backend() == "cpu" else ON_ACCELERATOR
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in ready.leaves)
     program = _program(ready.tree, shapes, ready.order, start, block, joints.shape[1], dtype)
-    pose_leaves, pose_tree = jax.tree.flatten(home_shapes(mech)[0])
-    poses = [np.empty((count, *leaf.shape), dtype) for leaf in pose_leaves]
-    numbers = np.empty((count, len(Rows._fields) - 1), dtype)
-    columns = np.split(
-        np.arange(sum(leaf.size for leaf in pose_leaves)), np.cumsum([p.size for p in pose_leaves])[:-1]
-    )
-    flat_guess = None
+    pose_leaves, pose_tree = jax.tree.flatten(ready.shapes[0])
+    poses = [_aligned((count, *leaf.shape), dtype) for leaf in pose_leaves]
+    numbers = [
+        _aligned((count,), np.int32 if name in ("status", "steps") else dtype) for name in Rows._fields[1:]
+    ]
+    cuts = np.cumsum([leaf.size for leaf in pose_leaves])
     if guess is not None:
-        rows = (1,) if one_guess else (count,)
-        flat_guess = np.concatenate(
-            [np.asarray(leaf, dtype).reshape(*rows, -1) for leaf in jax.tree.leaves(guess)], 1
-        )
-        flat_guess = flat_guess[0] if one_guess else flat_guess
+        flat = [
+            np.asarray(leaf, dtype).reshape(1 if one_guess else count, -1) for leaf in jax.tree.leaves(guess)
+        ]
+        guess = np.concatenate(flat, axis=1)
 
     def run(first: int) -> None:
         rows = slice(first, min(first + block, count))
         size = rows.stop - first
-        given = [jnp.asarray(_padded(joints[rows], block)), jnp.asarray(np.int32(size))]
-        if flat_guess is not None:
-            given.append(jnp.asarray(flat_guess if one_guess else _padded(flat_guess[rows], block)))
-        out = np.asarray(program([*ready.leaves, *given])[0])  # (chunks, values, lanes)
+        given = [_padded(joints[rows], block), np.int32(size)]
+        if guess is not None:
+            given.append(guess[0] if one_guess else _padded(guess[rows], block))
+        out = np.asarray(program([*ready.leaves, *map(jnp.asarray, given)])[0])  # (chunks, values, lanes)
         out = out[: -(-size // out.shape[2])]
-        for pose, column in zip(poses, columns, strict=True):
-            part = out[:, column[0] : column[-1] + 1].transpose(0, 2, 1)
+        for pose, begin, end in zip(poses, (0, *cuts), cuts, strict=False):
+            part = out[:, begin:end].transpose(0, 2, 1)
             pose[rows] = part.reshape(-1, *pose.shape[1:])[:size]
-        numbers[rows] = out[:, columns[-1][-1] + 1 :].transpose(0, 2, 1).reshape(-1, numbers.shape[1])[:size]
+        for column, number in enumerate(numbers, cuts[-1]):
+            number[rows] = out[:, column].reshape(-1)[:size]
 
     starts = range(0, count, block)
     list(_threads().map(run, starts) if len(starts) > 1 else map(run, starts))
-    status, residual, steps, sigma_min, det_sign = numbers.T
-    return Rows(
-        jax.tree.unflatten(pose_tree, poses),
-        status.astype(np.int32),
-        residual,
-        steps.astype(np.int32),
-        sigma_min,
-        det_sign,
-    )
+    return Rows(jax.tree.unflatten(pose_tree, poses), *numbers)
 
 
 @lru_cache(maxsize=64)
@@ -162,6 +158,14 @@ def _as_pose(flat: Entries, like: Any) -> Any:
     for leaf in leaves:
         parts.append(Entries(leaf.shape, [next(items) for _ in leaf.items]))
     return jax.tree.unflatten(tree, parts)
+
+
+def _aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """An array that JAX takes over without a copy."""
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    memory = np.empty(size + 64, np.uint8)
+    begin = -memory.ctypes.data % 64
+    return memory[begin : begin + size].view(dtype).reshape(shape)
 
 
 def _padded(rows: np.ndarray, count: int) -> np.ndarray:

@@ -49,9 +49,14 @@ class Mechanism(abc.ABC):
         dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)(cls)
         names = tuple(field.name for field in dataclasses.fields(cls))
 
-        def flatten(mechanism):
-            keys = jax.tree_util.GetAttrKey
-            return tuple((keys(name), getattr(mechanism, name)) for name in names), None
+        keys = tuple(map(jax.tree_util.GetAttrKey, names))
+
+        def flatten(mechanism):  # without the keys: this one is called for every jitted call
+            fields = mechanism.__dict__
+            return [fields[name] for name in names], None
+
+        def flatten_with_keys(mechanism):
+            return tuple(zip(keys, flatten(mechanism)[0], strict=True)), None
 
         def unflatten(_, leaves):  # JAX rebuilds with tracers: only callers meet __post_init__
             mechanism = object.__new__(cls)
@@ -59,7 +64,7 @@ class Mechanism(abc.ABC):
                 object.__setattr__(mechanism, name, leaf)
             return mechanism
 
-        jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten)
+        jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):

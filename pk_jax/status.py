@@ -15,6 +15,6 @@ class Status(enum.IntEnum):
     SINGULAR = 4  # the velocity relation has lost rank here
     STALLED = 5  # the iteration stopped moving away from a solution
     STEP_LIMIT = 6  # the iteration was still moving when its steps ran out
-    NONFINITE = 7  # NaN or infinity came in, or appeared on the way
+    NONFINITE = 7  # NaN or infinity appeared on the way
     INCOMPLETE = 8  # some solutions may be missing
-    BAD_INPUT = 9  # the question is outside what the method is defined for
+    BAD_INPUT = 9  # NaN, infinity, a negative length came in: there is no question to answer

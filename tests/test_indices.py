@@ -160,8 +160,8 @@ CASES = {
             "OK": ((0.4, 0.9), *expected(rpr_jacobian(np.array([0.4, 0.9])))),
             "SINGULAR, on the base line": ((0.3, 0.0), 0.0, 0.0),
             "SINGULAR, on the base line outside": ((-1.7, 0.0), 0.0, 0.0),
-            "NONFINITE, NaN": ((np.nan, 1.0), np.nan, np.nan),
-            "NONFINITE, infinite": ((0.0, np.inf), np.nan, np.nan),
+            "BAD_INPUT, NaN": ((np.nan, 1.0), np.nan, np.nan),
+            "BAD_INPUT, infinite": ((0.0, np.inf), np.nan, np.nan),
         },
     ),
     "2-RRR": (
@@ -171,8 +171,8 @@ CASES = {
             "SINGULAR, stretched": (along(2.2, LA + LB), 0.0, np.inf),
             "SINGULAR, folded": (along(2.0, LB - LA), 0.0, np.inf),
             "UNREACHABLE": ((9.0, 9.0), np.nan, np.nan),
-            "NONFINITE, NaN": ((0.1, np.nan), np.nan, np.nan),
-            "NONFINITE, infinite": ((-np.inf, 1.0), np.nan, np.nan),
+            "BAD_INPUT, NaN": ((0.1, np.nan), np.nan, np.nan),
+            "BAD_INPUT, infinite": ((-np.inf, 1.0), np.nan, np.nan),
         },
     ),
 }

@@ -34,8 +34,8 @@ IK_ROWS = {  # of the five-bar: its first leg stands at RIGHT and reaches from 1
     "UNREACHABLE": (9.0, 9.0),
     "SINGULAR, stretched": RIGHT + along(2.2, 3.15),
     "SINGULAR, folded": RIGHT + along(2.0, 1.15),
-    "NONFINITE, NaN": (NAN, 1.7),
-    "NONFINITE, infinite": (0.1, INF),
+    "BAD_INPUT, NaN": (NAN, 1.7),
+    "BAD_INPUT, infinite": (0.1, INF),
 }
 
 
@@ -84,7 +84,7 @@ def test_inverse_of_the_two_rpr_at_a_base_joint_is_singular():
 def test_inverse_without_a_closed_form():
     poses = np.array([[0.05, 0.02, -0.6], [0.0, 0.0, -5.0], [NAN, 0.0, -0.6], [0.0, -0.1, -0.7]])
     found = pk.inverse_kinematics(DELTA, poses)
-    assert statuses(found) == ["OK", "STALLED", "NONFINITE", "OK"]
+    assert statuses(found) == ["OK", "STALLED", "BAD_INPUT", "OK"]
     for row in (0, 3):
         np.testing.assert_allclose(DELTA.residual(poses[row], found.joints[row]), 0, atol=1e-15)
     assert np.all(np.isnan(found.joints[1:3]))
@@ -96,7 +96,7 @@ def test_inverse_without_a_closed_form():
 def test_forward_statuses_of_the_two_rpr():
     joints = np.array([[2.0, 1.0], [5.0, 1.0], [1.0, 1.0], [1.0, 3.0], [NAN, 1.0], [2.0, INF]])
     found = pk.forward_kinematics(RPR, joints)
-    assert statuses(found) == ["OK", "UNREACHABLE", "SINGULAR", "SINGULAR", "NONFINITE", "NONFINITE"]
+    assert statuses(found) == ["OK", "UNREACHABLE", "SINGULAR", "SINGULAR", "BAD_INPUT", "BAD_INPUT"]
     np.testing.assert_allclose(found.pose[0], [-0.75, np.sqrt(15) / 4], rtol=0, atol=1e-15)
     assert np.all(np.isnan(found.pose[1:]))
     # on a type II singularity the pose is there, to the square root of the precision
@@ -165,7 +165,7 @@ def test_forward_starting_at_the_solution_or_on_a_singularity():
     solution = [-0.4375, np.sqrt(4 - 1.4375**2)]
     guesses = np.array([solution, [0.0, 0.0], [NAN, 1.0]])
     found = pk.forward_kinematics(RPR, np.array([[2.0, 1.5]] * 3), guesses)
-    assert statuses(found)[0::2] == ["OK", "NONFINITE"]
+    assert statuses(found)[0::2] == ["OK", "BAD_INPUT"]
     assert int(found.steps[0]) <= 3
     assert int(found.status[1]) != Status.OK and np.all(np.isnan(found.pose[1:]))
 
@@ -193,7 +193,7 @@ def test_redundant_lengths_that_disagree_are_inconsistent():
     lengths = np.linalg.norm(pose - SPARE.base, axis=1)
     rows = np.stack([lengths, lengths + [0.01, 0, 0], lengths + [1e-8, 0, 0], lengths * np.nan])
     found = pk.forward_kinematics(SPARE, rows)
-    assert statuses(found) == ["OK", "INCONSISTENT", "OK", "NONFINITE"]
+    assert statuses(found) == ["OK", "INCONSISTENT", "OK", "BAD_INPUT"]
     np.testing.assert_allclose(found.pose[0], pose, rtol=0, atol=1e-14)
     np.testing.assert_array_equal(found.det_sign[:3], 0)
     assert found.residual[1] > 1e-3
@@ -325,7 +325,7 @@ class Rail(pk.LegMechanism):
 def test_a_users_unguarded_square_root_is_guarded(gradients):
     """NaN beyond the rod's reach and an infinite derivative at its end: neither gets out."""
     rail, poses = Rail(rod=1.0), np.array([[0.1, 0.6], [0.0, 1.5], [0.0, 1.0], [NAN, 0.0]])
-    assert statuses(pk.inverse_kinematics(rail, poses)) == ["OK", "UNREACHABLE", "SINGULAR", "NONFINITE"]
+    assert statuses(pk.inverse_kinematics(rail, poses)) == ["OK", "UNREACHABLE", "SINGULAR", "BAD_INPUT"]
     in_geometry, in_pose = gradients[0](rail, poses)
     np.testing.assert_array_equal(in_pose[1:], 0)
     expected = np.cos(0.9) - np.cos(-0.7)  # of sin(x + s) + sin(x - s) in s = sqrt(rod^2 - y^2) = 0.8

@@ -36,7 +36,7 @@ def local_indices(mech: Mechanism, pose: Any, branch: Any = None) -> LocalIndice
     lengths, or all joints angles, that changes nothing. Resistivity keeps its unit: for the 2-RRR
     1/length^2. For non-square J it is 1/sqrt(det(J J^T)).
 
-    Status: OK; SINGULAR: the limits above are given; UNREACHABLE or NONFINITE: NaN is given. The
+    Status: OK; SINGULAR: the limits above are given; UNREACHABLE or BAD_INPUT: NaN is given. The
     derivatives are finite everywhere; at an exactly isotropic pose, where 1/kappa has a conical
     point, the derivative of the isotropy is the mean of the directional ones, 0.
     """

@@ -14,9 +14,18 @@ import jax.numpy as jnp
 
 from pk_jax.geometry.planar import rotation
 from pk_jax.geometry.rotations import cayley
-from pk_jax.geometry.se3 import SE3
+from pk_jax.geometry.se3 import ORTHONORMAL_TO, SE3
 
 Pose = Any  # jax.Array or SE3
+
+
+def is_pose(pose: Pose) -> jax.Array:
+    """() False where a rotation is not orthonormal or a reflection."""
+    if not isinstance(pose, SE3):
+        return jnp.asarray(True)
+    r = pose.rotation
+    off = jnp.max(jnp.abs(r @ r.T - jnp.eye(3, dtype=r.dtype)))
+    return (off <= ORTHONORMAL_TO) & (jnp.sum(r[2] * jnp.cross(r[0], r[1])) > 0)
 
 
 def retract(pose: Pose, twist: jax.Array) -> Pose:
@@ -25,6 +34,15 @@ def retract(pose: Pose, twist: jax.Array) -> Pose:
         moved = (pose.translation + twist[:3], cayley(twist[3:]) @ pose.rotation)
         return jax.tree.unflatten(jax.tree.structure(pose), moved)
     return pose + twist
+
+
+def difference(pose: Pose, other: Pose) -> jax.Array:
+    """The tangent that retracts `pose` to `other`. -> (n,)"""
+    if isinstance(pose, SE3):
+        turn = other.rotation @ pose.rotation.T
+        axial = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        return jnp.concatenate([other.translation - pose.translation, 2 * axial / (1 + jnp.trace(turn))])
+    return other - pose
 
 
 def tangent_size(pose: Pose) -> int:

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from pk_jax import checks
 from pk_jax.geometry.se3 import SE3
@@ -79,3 +80,24 @@ def where(condition: jax.Array, chosen: Any, other: Any) -> Any:
     if isinstance(other, float | int):
         return jax.tree.map(lambda leaf: jnp.where(condition, leaf, other), chosen)
     return jax.tree.map(lambda *leaves: jnp.where(condition, *leaves), chosen, other)
+
+
+def without_derivatives(function: Callable) -> Callable:
+    """`function` as a constant to differentiation, of whatever order and mode, and whatever it is made of."""
+
+    @jax.custom_jvp
+    def constant(*arguments):
+        return function(*arguments)
+
+    @constant.defjvp
+    def _(arguments, _):
+        found = constant(*arguments)
+        return found, jax.tree.map(_zero_tangent, found)
+
+    return constant
+
+
+def _zero_tangent(leaf: jax.Array) -> Any:
+    if jnp.issubdtype(leaf.dtype, jnp.floating):
+        return jnp.zeros_like(leaf)
+    return np.zeros(leaf.shape, jax.dtypes.float0)

@@ -2,74 +2,80 @@
 
 Choosing pivots lane by lane costs a hundred times the elimination. The order is chosen once, by
 complete pivoting at a reference matrix, and holds in its neighbourhood; a lane on which it fails shows
-in its residual and is solved again by other means.
+in its residual and is solved again by other means. Where the reference is traced, its inverse takes
+the part of the order: near it, inverse @ matrix is near the identity and needs no pivots.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pk_jax.kinematics.lanes import Entries, Lane, minus, over, stack, times, total
+from pk_jax.kinematics.lanes import Lane, minus, over, times, total
 
-Order = tuple[Any, Any]  # rows and columns: tuples of int, or traced index arrays (n,)
 Matrix = list[list[Lane]]
 
 
-def pivot_order(matrix: Any) -> Order:
-    """Rows and columns of a regular matrix (n, n) in the order of complete pivoting.
+class Order(NamedTuple):
+    """In which order rows and columns are eliminated."""
 
-    Tuples where the matrix is known, else index arrays, which is slower: the rows must be gathered.
-    """
-    if isinstance(matrix, jax.core.Tracer):
-        return _pivot_order(matrix, jnp)
-    rows, columns = _pivot_order(np.asarray(matrix), np)
-    return tuple(rows.tolist()), tuple(columns.tolist())
+    rows: tuple[int, ...]
+    columns: tuple[int, ...]
+
+    def parity(self) -> int:
+        """1 where the two permutations together are even, -1 where they are odd."""
+        pairs = ((order, i, j) for order in self for j in range(len(order)) for i in range(j))
+        return 1 - 2 * (sum(order[i] > order[j] for order, i, j in pairs) % 2)
 
 
-def _pivot_order(matrix: Any, np: Any) -> tuple[Any, Any]:
-    """The same lines for NumPy and for jax.numpy."""
-    n = matrix.shape[0]
+class Reference(NamedTuple):
+    """A matrix near which all others are: its inverse, and the sign of its determinant."""
+
+    inverse: Matrix
+    sign: Lane
+
+
+def pivot_order(matrix: np.ndarray) -> Order:
+    """The order of complete pivoting of a regular matrix (n, n)."""
+    n = len(matrix)
     index, is_open = np.arange(n), np.ones((n, n), bool)
     rows, columns = [], []
     for _ in range(n):
         sizes = np.where(is_open, np.abs(matrix), -1)
         # among pivots equal up to roundoff the first, so that the order does not hang on roundoff
-        first = np.argmax(sizes.ravel() >= np.max(sizes) * (1 - 1e-6))
-        i, j = first // n, first % n
-        pivot = matrix[i, j]
-        matrix = matrix - np.outer(matrix[:, j] / np.where(pivot == 0, 1, pivot), matrix[i])
+        i, j = np.argwhere(sizes >= np.max(sizes) * (1 - 1e-6))[0].tolist()
+        if matrix[i, j] != 0:
+            matrix = matrix - np.outer(matrix[:, j] / matrix[i, j], matrix[i])
         is_open = is_open & (index != i)[:, None] & (index != j)
         rows.append(i)
         columns.append(j)
-    return np.stack(rows), np.stack(columns)
+    return Order(tuple(rows), tuple(columns))
 
 
 class Factors(NamedTuple):
-    """L U of the matrix in its order: unit L below the diagonal of `lu`, reciprocal pivots beside it."""
+    """L U of the matrix as `by` arranges it: unit L below the diagonal, reciprocal pivots beside it."""
 
     lu: Matrix
     reciprocals: list[Lane]
-    order: Order
+    by: Order | Reference
 
-    def det(self) -> Lane:
-        """Determinant, up to the sign of the order."""
+    def sign(self) -> Lane:
+        """Sign of the determinant."""
         product: Lane = 1.0
         for k, row in enumerate(self.lu):
             product = times(product, row[k])
-        return product
+        return jnp.sign(product) * (self.by.parity() if isinstance(self.by, Order) else self.by.sign)
 
 
-def factor(matrix: Matrix, order: Order) -> Factors:
-    """Gaussian elimination of a square matrix in the given order of pivots."""
-    rows, columns = order
-    if isinstance(rows, tuple):
-        lu = [[matrix[i][j] for j in columns] for i in rows]
+def factor(matrix: Matrix, by: Order | Reference) -> Factors:
+    """Gaussian elimination of a square matrix."""
+    if isinstance(by, Order):
+        lu = [[matrix[i][j] for j in by.columns] for i in by.rows]
     else:
-        lu = [list(row) for row in _gathered(_gathered(matrix, rows, 0), columns, 1)]
+        lu = [_times(by.inverse, column) for column in zip(*matrix, strict=True)]
+        lu = [list(row) for row in zip(*lu, strict=True)]
     n = len(lu)
     reciprocals = []
     for k in range(n):
@@ -78,15 +84,14 @@ def factor(matrix: Matrix, order: Order) -> Factors:
             lu[i][k] = times(lu[i][k], reciprocals[k])
             for j in range(k + 1, n):
                 lu[i][j] = minus(lu[i][j], times(lu[i][k], lu[k][j]))
-    return Factors(lu, reciprocals, order)
+    return Factors(lu, reciprocals, by)
 
 
 def solve(factors: Factors, right: list[Lane]) -> list[Lane]:
     """x with A x = right."""
-    lu, reciprocals, (rows, columns) = factors
-    is_static = isinstance(rows, tuple)
+    lu, reciprocals, by = factors
     n = len(lu)
-    y = [right[i] for i in rows] if is_static else _gathered([right], rows, 1)[0]
+    y = [right[i] for i in by.rows] if isinstance(by, Order) else _times(by.inverse, right)
     for i in range(n):
         for j in range(i):
             y[i] = minus(y[i], times(lu[i][j], y[j]))
@@ -94,12 +99,15 @@ def solve(factors: Factors, right: list[Lane]) -> list[Lane]:
         for j in range(i + 1, n):
             y[i] = minus(y[i], times(lu[i][j], y[j]))
         y[i] = times(y[i], reciprocals[i])
-    places = np.argsort(columns) if is_static else jnp.argsort(columns)
-    return [y[i] for i in places] if is_static else _gathered([y], places, 1)[0]
+    return [y[i] for i in np.argsort(by.columns)] if isinstance(by, Order) else y
+
+
+def _times(matrix: Matrix, vector: list[Lane]) -> list[Lane]:
+    return [total([times(a, x) for a, x in zip(row, vector, strict=True)]) for row in matrix]
 
 
 def inverse(factors: Factors) -> Matrix:
-    """A^-1, by columns of the identity; for an order known beforehand their leading zeros vanish."""
+    """A^-1, by columns of the identity, whose leading zeros vanish."""
     n = len(factors.lu)
     columns = [solve(factors, [1.0 if i == k else 0.0 for i in range(n)]) for k in range(n)]
     return [list(row) for row in zip(*columns, strict=True)]
@@ -136,11 +144,3 @@ def back_substitute(r: Matrix, right: list[Lane]) -> list[Lane]:
             x[i] = minus(x[i], times(r[i][j], x[j]))
         x[i] = over(x[i], r[i][i])
     return x
-
-
-def _gathered(matrix: Matrix, indices: jax.Array, axis: int) -> Matrix:
-    """Rows or columns in an order that is known only at run time."""
-    items = [item for row in matrix for item in row]
-    array = stack(Entries((len(matrix), len(matrix[0])), items))
-    array = jnp.take(array, indices, axis=axis)
-    return [list(row) for row in array]

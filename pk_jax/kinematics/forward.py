@@ -10,16 +10,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_batching import custom_vmap
 
 from pk_jax import checks
 from pk_jax.geometry.poses import retract, tangent_size
 from pk_jax.kinematics import lane_newton, newton, rows
-from pk_jax.kinematics.batching import home_shapes, over_rows, rows_of, same_size, where
+from pk_jax.kinematics.batching import (
+    all_finite,
+    home_shapes,
+    over_rows,
+    rows_of,
+    same_size,
+    where,
+    without_derivatives,
+)
 from pk_jax.kinematics.closure import pose_scale
+from pk_jax.kinematics.lane_newton import Home
 from pk_jax.kinematics.lanes import is_entries, split, stack
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
 
+AGAIN = 64  # lost rows of a traced batch that are solved again at a time
+WORTH_LANES = 4096  # rows of a traced batch
 UNITS_DIFFER_BY = 100  # joints that many times the length of the home's are most likely in another unit
 
 
@@ -60,34 +72,25 @@ def forward_kinematics(mech: Mechanism, joints: Any, guess: Any = None) -> Forwa
         return _known(mech, joints, guess)
     home_pose, home_joints = home_shapes(mech)
     joints, many = rows_of("joints", joints, home_joints)
-    home, order = (None, UNKNOWN) if not checks.is_concrete(mech) else rows.prepared(mech)[:2]
+    home, order = rows.prepared(mech)[:2] if checks.is_concrete(mech) else (None, None)
     if guess is None:
         return _solve(mech, home, (joints,), (many,), order)
     guess, guesses = rows_of("guess", guess, home_pose)
     return _solve(mech, home, (joints, guess), (many, guesses), order)
 
 
-UNKNOWN = "the geometry is traced: the order of pivots is found at run time"
-
-
-# --- traced: one function, differentiable
+# --- traced values: one row's function, differentiable, that sends batches to the lanes
 
 
 @partial(jax.jit, static_argnums=(3, 4))
 def _solve(mech, home, joints_and_guess, are_batched, order):
+    if home is None:
+        home = lane_newton.home_from(*lane_newton.at_home(mech), mech.actuated_rows)
     return over_rows(lambda *row: _one(mech, home, order, *row), joints_and_guess, are_batched)
 
 
-def _one(mech: Mechanism, home: Any, order: Any, joints: jax.Array, guess: Any = None) -> ForwardKinematics:
-    fixed, q = lax.stop_gradient((mech, joints))
-    if order is UNKNOWN:
-        pose, at_pose, jacobian = lane_newton.at_home(fixed)
-        order = lane_newton.order_of(jacobian, mech.actuated_rows)
-        home = lane_newton.home_from(pose, at_pose, jacobian, order, mech.actuated_rows)
-    start = lax.stop_gradient(home.pose if guess is None else guess)
-    found = _attempt_one(fixed, home, order, q, None if guess is None else start)
-    found = _persist(fixed, home, order, q, start, found, is_home=guess is None)
-
+def _one(mech: Mechanism, home: Home, order: Any, joints: jax.Array, guess: Any = None) -> ForwardKinematics:
+    found = _locate(mech, home, order, joints, guess)
     is_ok = found.status == Status.OK
     home_joints = mech.home()[1]  # lost rows work at home and are masked after
     pose = newton.implicit(
@@ -99,7 +102,46 @@ def _one(mech: Mechanism, home: Any, order: Any, joints: jax.Array, guess: Any =
     return found._replace(pose=where(is_ok, pose, jnp.nan))
 
 
-def _attempt_one(mech: Mechanism, home: Any, order: Any, joints: jax.Array, guess: Any) -> ForwardKinematics:
+def _locate(mech: Mechanism, home: Home, order: Any, joints: jax.Array, guess: Any) -> ForwardKinematics:
+    """One row without derivatives; under `vmap` all rows on lanes."""
+
+    @custom_vmap
+    def locate(mech, home, joints, guess):
+        return _persist(mech, home, joints, guess, _untried(home))
+
+    @locate.def_vmap
+    def _(size, is_batched, mech, home, joints, guess):
+        # a batch of mechanisms, or one for which compiling the lanes, some seconds, would not pay
+        if any(jax.tree.leaves(is_batched[:2])) or size < WORTH_LANES:
+            axes = jax.tree.map(lambda batched: 0 if batched else None, is_batched)
+            found = jax.vmap(locate.fun, in_axes=axes)(mech, home, joints, guess)
+        else:
+            each = lambda leaf, batched: leaf if batched else jnp.broadcast_to(leaf, (size, *leaf.shape))
+            joints, guess = jax.tree.map(each, (joints, guess), tuple(is_batched[2:]))
+            found = _locate_all(mech, home, order, joints, guess)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return without_derivatives(locate)(*lax.stop_gradient((mech, home, joints, guess)))
+
+
+def _locate_all(mech: Mechanism, home: Home, order: Any, joints: jax.Array, guess: Any) -> ForwardKinematics:
+    """All rows of a batch on lanes, the lost ones again, a few at a time."""
+    found = jax.vmap(partial(_attempt_one, mech, home, order))(joints, guess)
+    count = joints.shape[0]
+
+    def persist(state):
+        found, is_lost = state
+        these = jnp.nonzero(is_lost, size=min(count, AGAIN), fill_value=count)[0]
+        taken = jax.tree.map(lambda leaf: leaf.at[these].get(mode="clip"), (joints, guess, found))
+        again = jax.vmap(partial(_persist, mech, home))(*taken)
+        put = lambda whole, part: whole.at[these].set(part, mode="drop")
+        return jax.tree.map(put, found, again), is_lost.at[these].set(False, mode="drop")
+
+    is_lost = found.status == Status.STALLED
+    return lax.while_loop(lambda state: jnp.any(state[1]), persist, (found, is_lost))[0]
+
+
+def _attempt_one(mech: Mechanism, home: Home, order: Any, joints: jax.Array, guess: Any) -> ForwardKinematics:
     """Newton on the lanes of one row."""
     entries, at_home, q, start = jax.tree.map(
         split, (mech, home, joints, home.pose if guess is None else guess)
@@ -108,40 +150,41 @@ def _attempt_one(mech: Mechanism, home: Any, order: Any, joints: jax.Array, gues
     return _answer(jax.tree.map(stack, found.pose, is_leaf=is_entries), *found[1:])
 
 
+def _untried(home: Home) -> ForwardKinematics:
+    zero = jnp.zeros_like(home.sign)
+    count = jnp.zeros((), jnp.int32)
+    return ForwardKinematics(home.pose, count + Status.STALLED, zero, count, zero, zero, home.pose)
+
+
 def _persist(
-    mech: Mechanism,
-    home: Any,
-    order: Any,
-    joints: jax.Array,
-    start: Any,
-    found: ForwardKinematics,
-    *,
-    is_home: bool,
+    mech: Mechanism, home: Home, joints: jax.Array, guess: Any, found: ForwardKinematics
 ) -> ForwardKinematics:
-    """A row that Newton has lost again, by Levenberg-Marquardt."""
-    is_lost = found.status == Status.STALLED
-    start = where(is_lost, start, home.pose)
-    joints = jnp.where(is_lost, joints, home.joints)
+    """A STALLED row again, by Levenberg-Marquardt; any other as it is."""
+    is_given = all_finite(joints) if guess is None else all_finite(joints, guess)
+    if mech.joints_are_distances:
+        is_given = is_given & jnp.all(joints > 0)
+    is_lost = (found.status == Status.STALLED) & is_given
+    start = home.pose if guess is None else where(is_lost, guess, home.pose)
+    q = jnp.where(is_lost, joints, home.joints)
     solution = newton.solve(
-        lambda x: mech.linearize(x, joints), retract, start, scale=pose_scale(mech, start), is_needed=is_lost
+        lambda x: mech.linearize(x, q), retract, start, scale=pose_scale(mech, start), is_needed=is_lost
     )
-    entries, at_home, q, at_start, at = jax.tree.map(split, (mech, home, joints, start, solution.point))
-    judged = lane_newton.judge(entries, q, at, order, mech.actuated_rows)
+    judged = lane_newton.judge_one(mech, q, solution.point)
     is_square = home.first.shape[0] == home.first.shape[1]
-    side = judged.sign * at_home.sign.items[0]
-    if is_square and not is_home:
-        side = judged.sign * lane_newton.start_sign(entries, q, at_start, order, None)
+    side = judged.sign * home.sign
+    if is_square and guess is not None:
+        side = judged.sign * lane_newton.sign_of_det(mech.linearize(start, q)[1], None)
     status = lane_newton.verdict(judged, solution.is_stationary, side, is_square=is_square)
     limit_hit = (status == Status.STALLED) & ~solution.is_stationary
     status = jnp.where(limit_hit, Status.STEP_LIMIT, status)
     if hasattr(mech, "forward"):
-        is_unreal = ~jnp.any(mech.forward(joints)[1])
+        is_unreal = ~jnp.any(mech.forward(q)[1])
         is_unsolved = (status == Status.STALLED) | (status == Status.STEP_LIMIT)
         status = jnp.where(is_unsolved & is_unreal, Status.UNREACHABLE, status)
+    status = jnp.where(is_given, status, Status.BAD_INPUT)
     steps = found.steps + solution.steps
-    det_sign = judged.sign * home.sign
-    again = _answer(solution.point, status, judged.residual, steps, judged.sigma_min, det_sign)
-    return where(is_lost, again, found)
+    again = _answer(solution.point, status, judged.residual, steps, judged.sigma_min, judged.sign * home.sign)
+    return where((found.status == Status.STALLED), again, found)
 
 
 def _answer(
@@ -173,7 +216,7 @@ def _known(mech: Mechanism, joints: Any, guess: Any) -> ForwardKinematics:
         if int(found.status) != Status.STALLED:
             return found
         joints, guess, found = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (joints, guess, found))
-        found = _again(mech, home, joints, guess, found, order)
+        found = _again(mech, home, joints, guess, found)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), found)
     if many and guesses:
         same_size((joints, guess), (True, True))
@@ -193,7 +236,7 @@ def _known(mech: Mechanism, joints: Any, guess: Any) -> ForwardKinematics:
             if guesses or guess is None
             else jax.tree.map(lambda leaf: _repeated(leaf, len(joints)), guess)
         )
-        found = _again(mech, home, joints, each, found, order)
+        found = _again(mech, home, joints, each, found)
     return jax.device_put(found)  # arrays that are aligned are taken over without a copy
 
 
@@ -203,7 +246,7 @@ def _one_known(mech, home, joints, guess, order):
 
 
 def _again(
-    mech: Mechanism, home: Any, joints: np.ndarray, guess: Any, found: ForwardKinematics, order: Any
+    mech: Mechanism, home: Home, joints: np.ndarray, guess: Any, found: ForwardKinematics
 ) -> ForwardKinematics:
     """The lost rows of a batch once more, in blocks of few sizes so that few are compiled."""
     lost = np.flatnonzero(np.asarray(found.status) == Status.STALLED)
@@ -214,19 +257,15 @@ def _again(
         these = lost[first : first + size]
         padded = np.resize(these, size)
         taken = jax.tree.map(lambda leaf, padded=padded: leaf[padded], (joints, guess, found))
-        again = _persist_rows(mech, home, *taken, order)
+        again = _persist_rows(mech, home, *taken)
         for whole, part in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
             whole[these] = np.asarray(part)[: len(these)]
     return found
 
 
-@partial(jax.jit, static_argnums=5)
-def _persist_rows(mech, home, joints, guess, found, order):
-    def persist(joints, guess, found):
-        start = home.pose if guess is None else guess
-        return _persist(mech, home, order, joints, start, found, is_home=guess is None)
-
-    return jax.vmap(persist)(joints, guess, found)
+@jax.jit
+def _persist_rows(mech, home, joints, guess, found):
+    return jax.vmap(partial(_persist, mech, home))(joints, guess, found)
 
 
 def _blanked(tree: Any, rows: np.ndarray) -> Any:

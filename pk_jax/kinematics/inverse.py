@@ -11,6 +11,7 @@ import numpy as np
 from jax import lax
 
 from pk_jax import checks
+from pk_jax.geometry.poses import is_pose
 from pk_jax.kinematics import newton
 from pk_jax.kinematics.batching import all_finite, home_shapes, over_rows, rows_of, where
 from pk_jax.kinematics.closure import is_closed, joint_scale
@@ -37,9 +38,10 @@ def inverse_kinematics(
     free:    values of kinematically redundant joints, for mechanisms that have them
 
     Status: OK; UNREACHABLE: no real joints; SINGULAR: a type I singularity (a leg stretched or
-    folded), where the joints exist, in `candidate`, but their rates do not; NONFINITE: NaN or
+    folded), where the joints exist, in `candidate`, but their rates do not; BAD_INPUT: NaN or
     infinity in the pose. Without a closed form the joints come from Newton, started at home
-    (STALLED where that ends elsewhere). BAD_INPUT: a traced branch that holds no signs.
+    (STALLED where that ends elsewhere). BAD_INPUT also: a traced branch that holds no signs, or a
+    traced rotation that is none.
     The derivative of a row that is not OK is zero.
     """
     require_mechanism("inverse_kinematics", mech)
@@ -66,7 +68,7 @@ def _solve(mech, pose_and_branch, free, are_batched):
 
 def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = None) -> InverseKinematics:
     home_pose, home_joints = mech.home()
-    is_given = all_finite(pose)
+    is_given = all_finite(pose) & is_pose(pose)
     is_mode = True if branch is None else jnp.all(jnp.abs(branch) == 1)
     pose = where(is_given, pose, home_pose)  # lost rows work on the home pose and are masked after
     if hasattr(mech, "inverse"):
@@ -83,7 +85,7 @@ def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = No
     sigma = jnp.linalg.svd(jacobians.joints, compute_uv=False)[-1]
     status = jnp.where(sigma < SINGULAR_BELOW, Status.SINGULAR, Status.OK)
     status = jnp.where(is_real, status, failed)
-    status = jnp.where(is_given, status, Status.NONFINITE)
+    status = jnp.where(is_given, status, Status.BAD_INPUT)
     status = jnp.where(is_mode, status, Status.BAD_INPUT).astype(jnp.int32)
 
     is_ok = status == Status.OK

@@ -18,9 +18,9 @@ from jax import lax
 from pk_jax.geometry.poses import pose_units, retract
 from pk_jax.kinematics import elimination
 from pk_jax.kinematics.closure import closed_to, closure, pose_scale
-from pk_jax.kinematics.elimination import Matrix, Order
+from pk_jax.kinematics.elimination import Matrix, Order, Reference
 from pk_jax.kinematics.jacobian import SINGULAR_BELOW, units
-from pk_jax.kinematics.lanes import Entries, Lane, entrywise, is_entries, over, split, times, total
+from pk_jax.kinematics.lanes import Entries, Lane, entrywise, is_entries, over, times, total
 from pk_jax.mechanisms.base import Mechanism
 from pk_jax.status import Status
 
@@ -43,7 +43,7 @@ class Judged(NamedTuple):
     residual: Lane  # |F|
     is_closed: Lane  # square: F is zero to roundoff; redundant: the equations agree to 1e-6
     sigma_min: Lane  # at most the least singular value of A without units, at least it over sqrt(n)
-    sign: Lane  # of det A in the order of pivots; 0 where the actuated equations are redundant
+    sign: Lane  # of det A; 0 where the actuated equations are redundant
 
 
 class Attempt(NamedTuple):
@@ -80,13 +80,16 @@ def attempt(
         is_given = reduce(jnp.logical_and, finite, is_given)
         start = _where(is_given, start, home.pose)
     joints = _where(is_given, joints, home.joints)  # lost rows work at home and are masked after
-    ended = iterate(mech, joints, start, order, home.first.rows() if is_home else None, home.first.shape[1])
-    judged = judge(mech, joints, ended.pose, order, kind.actuated_rows)
+    by: Order | Reference | None = order
+    if order is None and home.square is not None:
+        by = Reference(home.square.rows(), home.sign.items[0])
+    ended = iterate(mech, joints, start, by, home.first.rows() if is_home else None, home.first.shape[1])
+    judged = judge(mech, joints, ended.pose, by, kind.actuated_rows)
     is_square = home.first.shape[0] == home.first.shape[1]
     det_sign = judged.sign * home.sign.items[0]
     side = det_sign
     if is_square and not is_home:
-        side = judged.sign * start_sign(mech, joints, start, order, None)
+        side = judged.sign * start_sign(mech, joints, start, by, None)
     status = verdict(judged, ended.is_stationary, side, is_square=is_square)
     status = jnp.where(is_given, status, Status.BAD_INPUT)
     return Attempt(ended.pose, status, judged.residual, ended.steps, judged.sigma_min, det_sign)
@@ -110,7 +113,8 @@ class Home(NamedTuple):
     pose: Any
     joints: jax.Array  # (m,)
     first: jax.Array  # (n, c) inverse of A
-    sign: jax.Array  # () of det A in the order of pivots; 0 where the actuated equations are redundant
+    square: jax.Array | None  # (n, n) inverse of the actuated rows of A; None where they are redundant
+    sign: jax.Array  # () of det A; 0 where the actuated equations are redundant
 
 
 def at_home(mech: Mechanism) -> tuple[Any, jax.Array, jax.Array]:
@@ -120,26 +124,36 @@ def at_home(mech: Mechanism) -> tuple[Any, jax.Array, jax.Array]:
 
 
 def order_of(jacobian: Any, actuated: int | None) -> Order | None:
-    """The order of pivots at home; None where the actuated equations are redundant."""
+    """The order of pivots at home; None where the actuated equations are redundant or A is traced."""
     square = jacobian[:actuated]
-    return elimination.pivot_order(square) if square.shape[0] == square.shape[1] else None
+    if not isinstance(square, np.ndarray) or square.shape[0] != square.shape[1]:
+        return None
+    return elimination.pivot_order(square)
 
 
-def home_from(pose: Any, joints: Any, jacobian: Any, order: Order | None, actuated: int | None) -> Home:
+def home_from(pose: Any, joints: Any, jacobian: Any, actuated: int | None) -> Home:
     """`Home` from what `at_home` gives, for NumPy arrays in NumPy."""
+    linalg = (np if isinstance(jacobian, np.ndarray) else jnp).linalg
+    square = jacobian[:actuated]
+    square = linalg.inv(square) if square.shape[0] == square.shape[1] else None
+    return Home(pose, joints, linalg.pinv(jacobian), square, sign_of_det(jacobian, actuated))
+
+
+def sign_of_det(jacobian: Any, actuated: int | None) -> Any:
+    """Sign of det A; 0 where the actuated equations are redundant. -> ()"""
     xp = np if isinstance(jacobian, np.ndarray) else jnp
-    sign = xp.zeros((), jacobian.dtype)
-    if order is not None:
-        sign = xp.sign(elimination.factor(split(jacobian).rows()[:actuated], order).det()).astype(jacobian.dtype)
-    return Home(pose, joints, xp.linalg.pinv(jacobian), sign)
+    square = jacobian[:actuated]
+    if square.shape[0] != square.shape[1]:
+        return xp.zeros((), jacobian.dtype)
+    return xp.sign(xp.linalg.det(square))
 
 
 def iterate(
-    mech: Any, joints: Entries, start: Any, order: Order | None, first: Matrix | None, equations: int
+    mech: Any, joints: Entries, start: Any, by: Order | Reference | None, first: Matrix | None, equations: int
 ) -> Ended:
     """At most `STEPS` clipped Newton steps from `start`, all arguments made of `Entries`.
 
-    order: of the pivots
+    by:    how A is eliminated; None where its actuated rows are redundant
     first: inverse of A (n, c) at the start, where it is known; spares the first elimination
     """
     like = joints.items[0]
@@ -170,7 +184,7 @@ def iterate(
         k, items, steps, has_stopped, is_stationary = state
         pose = _pose(items, shape)
         value, jacobian = entrywise(lambda m, x, q: m.linearize(x, q), mech, pose, joints)
-        pose, longest = moved(pose, _least_squares(jacobian.rows(), value.items, order))
+        pose, longest = moved(pose, _least_squares(jacobian.rows(), value.items, by))
         items = [jnp.where(has_stopped, *each) for each in zip(items, _items(pose, like)[0], strict=True)]
         steps = jnp.where(has_stopped, steps, steps + 1)
         is_stationary = is_stationary | (~has_stopped & (longest < small))
@@ -181,7 +195,9 @@ def iterate(
     return Ended(_pose(items, shape), is_stationary, steps)
 
 
-def judge(mech: Any, joints: Entries, pose: Any, order: Order | None, actuated: int | None) -> Judged:
+def judge(
+    mech: Any, joints: Entries, pose: Any, by: Order | Reference | None, actuated: int | None
+) -> Judged:
     """The equations at `pose`, evaluated afresh, and how far from a singularity it is."""
     like = joints.items[0]
     value, jacobian, size, of_pose = entrywise(closure, mech, pose, joints)
@@ -192,8 +208,8 @@ def judge(mech: Any, joints: Entries, pose: Any, order: Order | None, actuated: 
     within = [jnp.abs(f) <= allowed * s for f, s in zip(value.items, sizes.items, strict=True)]
     is_closed = reduce(jnp.logical_and, within)
 
-    factors = None if order is None else elimination.factor(rows[:actuated], order)
-    sign = jnp.zeros_like(like) if factors is None else jnp.sign(factors.det())
+    factors = None if by is None else elimination.factor(rows[:actuated], by)
+    sign = jnp.zeros_like(like) if factors is None else factors.sign()
     lengths = entrywise(_column_units, mech, pose).items
     scaled = [[times(a, u) for a, u in zip(row, lengths, strict=True)] for row in rows]
     norms = [jnp.sqrt(total([times(a, a) for a in row])) for row in scaled]
@@ -214,15 +230,28 @@ def judge(mech: Any, joints: Entries, pose: Any, order: Order | None, actuated: 
     return Judged(residual, is_closed, jnp.where(jnp.isfinite(sigma), sigma, 0), sign)
 
 
-def start_sign(mech: Any, joints: Entries, start: Any, order: Order, actuated: int | None) -> Lane:
-    """Sign of det A at the start, in the order of pivots."""
+def judge_one(mech: Mechanism, joints: jax.Array, pose: Any) -> Judged:
+    """The same for one row, in ordinary arrays: for where compiling costs more than computing."""
+    value, jacobian, size, of_pose = closure(mech, pose, joints)
+    is_square = jacobian.shape[0] == jacobian.shape[1]
+    allowed = closed_to(value.dtype) * size if is_square else INCONSISTENT_ABOVE * of_pose
+    scaled = jacobian * _column_units(mech, pose)
+    norms = jnp.linalg.norm(scaled, axis=1, keepdims=True)
+    sigmas = jnp.linalg.svd(scaled / jnp.where(norms > 0, norms, 1), compute_uv=False)
+    sigma = 1 / jnp.sqrt(jnp.sum(1 / sigmas**2))
+    sign = sign_of_det(jacobian, mech.actuated_rows)
+    return Judged(jnp.linalg.norm(value), jnp.all(jnp.abs(value) <= allowed), sigma, sign)
+
+
+def start_sign(mech: Any, joints: Entries, start: Any, by: Order | Reference, actuated: int | None) -> Lane:
+    """Sign of det A at the start."""
     jacobian = entrywise(lambda m, x, q: m.linearize(x, q)[1], mech, start, joints)
-    return jnp.sign(elimination.factor(jacobian.rows()[:actuated], order).det())
+    return elimination.factor(jacobian.rows()[:actuated], by).sign()
 
 
-def _least_squares(rows: Matrix, value: list[Lane], order: Order | None) -> list[Lane]:
+def _least_squares(rows: Matrix, value: list[Lane], by: Order | Reference | None) -> list[Lane]:
     if len(rows) == len(rows[0]):
-        return elimination.solve(elimination.factor(rows, order), value)
+        return elimination.solve(elimination.factor(rows, by), value)
     return elimination.back_substitute(*elimination.orthogonalize(rows, value))
 
 

@@ -222,9 +222,7 @@ _ARITHMETIC: dict[str, Callable] = {
     "copy_p": lambda a: a,
 }
 _ELEMENTWISE = frozenset(
-    """abs acos acosh and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type cos cosh eq erf exp
-    exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max min ne not or pow reduce_precision
-    rem round rsqrt select_n sign sin sinh sqrt stop_gradient tan tanh xor""".split()
+    ["abs", "acos", "acosh", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil", "clamp", "convert_element_type", "cos", "cosh", "eq", "erf", "exp", "exp2", "expm1", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "log", "log1p", "logistic", "lt", "max", "min", "ne", "not", "or", "pow", "reduce_precision", "rem", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt", "stop_gradient", "tan", "tanh", "xor"]
 )
 _REDUCTIONS: dict[str, Callable] = {
     "reduce_sum": plus,

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pk_jax.geometry.poses import retract
+from pk_jax.geometry.poses import difference, retract, tangent_size, tangent_zero
 from pk_jax.geometry.spread import evenly
 from pk_jax.kinematics.closure import is_closed, joint_scale, pose_scale
 from pk_jax.kinematics.forward import forward_kinematics
 from pk_jax.kinematics.inverse import inverse_kinematics
 from pk_jax.kinematics.jacobian import joint_jacobian, pose_jacobian, scaled_jacobians
+from pk_jax.kinematics.lanes import entrywise, split, stack
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
 
@@ -62,10 +63,11 @@ def check_mechanism(mech: Mechanism) -> LawReport:
 
 
 def _check_contract(mech: Mechanism, name: str) -> None:
-    pose, joints = _arrays(f"{name}.home", *mech.home())
+    pose, joints = mech.home()
+    _arrays(f"{name}.home", *jax.tree.leaves((pose, joints)))
     (value,) = _arrays(f"{name}.residual", mech.residual(pose, joints))
     _arrays(f"{name}.length", mech.length())
-    n, m, c = pose.shape[0], joints.shape[0], value.shape[0] if value.ndim else 0
+    n, m, c = tangent_size(pose), joints.shape[0], value.shape[0] if value.ndim else 0
     if value.ndim != 1 or c < n:
         raise ValueError(f"{name}.residual must have shape (c,) with c >= n = {n}, got {value.shape}")
     for units, count, attribute in ((mech.joint_units, m, "joint_units"), (mech.pose_units, n, "pose_units")):
@@ -93,10 +95,12 @@ def _check_contract(mech: Mechanism, name: str) -> None:
         raise ValueError(f"{name}.inverse must have shape {(m,)}, got {mech.inverse(pose).shape}")
     if hasattr(mech, "forward"):
         poses, is_real = mech.forward(joints)
-        if poses.shape[1:] != (n,) or is_real.shape != poses.shape[:1]:
+        wanted = [leaf.shape for leaf in jax.tree.leaves(pose)]
+        shapes = [leaf.shape for leaf in jax.tree.leaves(poses)]
+        if is_real.ndim != 1 or shapes != [(is_real.size, *shape) for shape in wanted]:
             raise ValueError(
-                f"{name}.forward must give poses (modes, {n}) and is_real (modes,), "
-                f"got {poses.shape} and {is_real.shape}"
+                f"{name}.forward must give poses (modes, *{wanted}) and is_real (modes,), "
+                f"got {shapes} and {is_real.shape}"
             )
 
 
@@ -120,6 +124,7 @@ def _laws(mech: Mechanism):
         "the closed-form modes contain the pose": 1e2 * exact,
         "every closed-form mode closes the loops": 1e2 * exact,
         "linearize gives dF/dx of the residual": exact,
+        "entry by entry: the same A": exact,
         "A against central differences": differences,
         "B against central differences": differences,
         "velocities: A x' + B q' = 0": exact,
@@ -155,9 +160,9 @@ def _measured(mech: Mechanism) -> list[jax.Array]:
 def _measure(mech: Mechanism):
     """Yield (law, error); traced once."""
     home, home_joints = mech.home()
-    eps = float(jnp.finfo(home.dtype).eps)
+    eps = float(jnp.finfo(home_joints.dtype).eps)
     dx, dq = pose_scale(mech, home), joint_scale(mech, home_joints)
-    n = home.shape[0]
+    n, dtype = tangent_size(home), dx.dtype
 
     yield "home closes every loop", ~is_closed(mech, home, home_joints)
     least = jnp.linalg.svd(scaled_jacobians(mech, home, home_joints).pose, compute_uv=False)[-1]
@@ -168,8 +173,10 @@ def _measure(mech: Mechanism):
     jacobians = scaled_jacobians(mech, home, home_joints)
     sigmas = [jnp.linalg.svd(j, compute_uv=False)[-1] for j in jacobians]
     spread = SPREAD * jnp.minimum(1, jnp.minimum(*sigmas))  # a singularity is about this far, or more
-    poses = home + spread * dx * _spread(SAMPLES, n, home.dtype)
-    both = jnp.stack([poses, poses.at[1].set(jnp.nan)])  # through one program, so that bits compare
+    poses = jax.vmap(lambda twist: retract(home, twist))(spread * dx * _spread(SAMPLES, n, dtype))
+    row = lambda i: jax.tree.map(lambda leaf: leaf[i], poses)
+    # through one program, so that bits compare
+    both = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf.at[1].set(jnp.nan)]), poses)
     rows = lax.map(lambda poses: inverse_kinematics(mech, poses), both)
     solved, poisoned = (jax.tree.map(lambda leaf, i=i: leaf[i], rows) for i in range(2))
     joints = solved.joints
@@ -181,33 +188,38 @@ def _measure(mech: Mechanism):
 
     found = forward_kinematics(mech, joints)
     yield "forward kinematics is OK near home (rows lost)", _lost(found.status)
-    yield "forward kinematics of inverse kinematics is the identity", _gap(found.pose, poses, dx)
+    yield "forward kinematics of inverse kinematics is the identity", _pose_gap(found.pose, poses, dx)
     looped = lax.map(lambda q: forward_kinematics(mech, q).pose, joints)
-    yield "a batch equals a loop: forward kinematics", _gap(found.pose, looped, dx)
+    yield "a batch equals a loop: forward kinematics", _pose_gap(found.pose, looped, dx)
 
-    a, b = pose_jacobian(mech, poses[0], joints[0]), joint_jacobian(mech, poses[0], joints[0])
+    pose, q = row(0), joints[0]
+    a, b = pose_jacobian(mech, pose, q), joint_jacobian(mech, pose, q)
     size = (jnp.abs(a) @ dx)[:, None]  # of each closure equation
     if hasattr(mech, "forward"):
         modes, is_real = jax.vmap(mech.forward)(joints)
-        gaps = jnp.max(jnp.abs(modes - poses[:, None]) / dx, axis=-1)
+        gap = lambda pose, modes: jax.vmap(lambda mode: jnp.max(jnp.abs(difference(pose, mode)) / dx))(modes)
+        gaps = jax.vmap(gap)(poses, modes)
         yield "the closed-form modes contain the pose", jnp.max(jnp.min(jnp.where(is_real, gaps, jnp.inf), 1))
         assembled = jax.vmap(lambda xs, q: jax.vmap(lambda x: mech.residual(x, q))(xs))(modes, joints)
         off = jnp.where(is_real[..., None], jnp.abs(assembled) / size[:, 0], 0)
         yield "every closed-form mode closes the loops", jnp.max(off)
 
-    pose, q = poses[0], joints[0]
-    plain = jax.jacfwd(lambda twist: mech.residual(retract(pose, twist), q))(jnp.zeros_like(pose))
+    zero = tangent_zero(pose)
+    plain = jax.jacfwd(lambda twist: mech.residual(retract(pose, twist), q))(zero)
     yield "linearize gives dF/dx of the residual", _gap(a * dx, plain * dx, size)
-    central = _central(lambda t: mech.residual(retract(pose, t * dx), q), n, eps ** (1 / 3), pose.dtype)
+    entries = entrywise(lambda m, x, q: m.linearize(x, q), *jax.tree.map(split, (mech, pose, q)))
+    by_entries = stack(entries[1])
+    yield "entry by entry: the same A", _gap(by_entries * dx, a * dx, size)
+    central = _central(lambda t: mech.residual(retract(pose, t * dx), q), n, eps ** (1 / 3), dtype)
     yield "A against central differences", _gap(a * dx, central, size)
-    central = _central(lambda t: mech.residual(pose, q + t * dq), q.shape[0], eps ** (1 / 3), q.dtype)
+    central = _central(lambda t: mech.residual(pose, q + t * dq), q.shape[0], eps ** (1 / 3), dtype)
     yield "B against central differences", _gap(b * dq, central, size)
 
-    rate = jax.jacfwd(lambda x: inverse_kinematics(mech, x).joints)(pose)
+    rate = jax.jacfwd(lambda twist: inverse_kinematics(mech, retract(pose, twist)).joints)(zero)
     yield "velocities: A x' + B q' = 0", jnp.max(jnp.abs((a + b @ rate) * dx) / size)
-    back = jax.jacfwd(lambda q: forward_kinematics(mech, q).pose)(q)
+    back = jax.jacfwd(lambda q: difference(pose, forward_kinematics(mech, q).pose))(q)
     yield "the derivatives of FK and IK are inverses", _gap(back @ rate * dx / dx[:, None], jnp.eye(n), 1)
-    load, velocity = _spread(2, n, pose.dtype)
+    load, velocity = _spread(2, n, dtype)
     load, velocity = load / dx, velocity * dx
     torques = back.T @ load  # virtual work: torques . q' = load . x'
     yield "power balance", jnp.abs(torques @ (rate @ velocity) - load @ velocity)
@@ -219,12 +231,12 @@ def _measure(mech: Mechanism):
     tangent = jax.tree.map(lambda leaf: leaf * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape), mech)
     moved = lambda h: jax.tree.map(lambda leaf, rate: leaf + h[0] * rate, mech, tangent)
     of_residual = jax.jvp(lambda g: g.residual(pose, q), (mech,), (tangent,))[1]
-    central = _central(lambda h: moved(h).residual(pose, q), 1, eps ** (1 / 3), pose.dtype)
+    central = _central(lambda h: moved(h).residual(pose, q), 1, eps ** (1 / 3), dtype)
     yield "dF/d(geometry) against central differences", _gap(of_residual[:, None], central, size)
     of_inverse = jax.jvp(lambda g: inverse_kinematics(g, pose).joints, (mech,), (tangent,))[1]
     yield "geometry: dF + B dq = 0", jnp.max(jnp.abs(of_residual + b @ of_inverse) / size[:, 0])
 
-    yield "a NaN row is told", poisoned.status[1] != Status.NONFINITE
+    yield "a NaN row is told", poisoned.status[1] != Status.BAD_INPUT
     others = np.delete(np.arange(SAMPLES), 1)
     yield "a NaN row changes no other row", jnp.sum(poisoned.joints[others] != joints[others])
 
@@ -242,6 +254,10 @@ def _spread(rows: int, columns: int, dtype) -> jax.Array:
 
 def _gap(a, b, scale) -> jax.Array:
     return jnp.max(jnp.abs(a - b) / scale)
+
+
+def _pose_gap(a: Any, b: Any, scale: jax.Array) -> jax.Array:
+    return jnp.max(jnp.abs(jax.vmap(difference)(a, b)) / scale)
 
 
 def _lost(status: jax.Array) -> jax.Array:

@@ -58,7 +58,7 @@ def prepared(mech: Mechanism) -> Prepared:
         with checks.known_values():
             pose, joints, jacobian = jax.tree.map(np.asarray, _at_home(mech))
             order = order_of(jacobian, mech.actuated_rows)
-            home = home_from(pose, joints, jacobian, order, mech.actuated_rows)
+            home = home_from(pose, joints, jacobian, mech.actuated_rows)
             leaves, tree = jax.tree.flatten((mech, home))
             leaves = [jnp.asarray(leaf) for leaf in leaves]
         mech_leaves = len(jax.tree.leaves(mech))

@@ -100,12 +100,12 @@ class Stewart(LegMechanism):
             )
         if self.stroke is not None:
             least, greatest = np.moveaxis(np.asarray(self.stroke), -1, 0)
-            if not np.all((0 < least) & (least < greatest)):
+            if not np.all((least > 0) & (least < greatest)):
                 raise ValueError(
                     f"Stewart.stroke must be 0 < least < greatest, got {np.asarray(self.stroke).tolist()}"
                 )
         for name in ("base_cone", "platform_cone"):
-            if (cone := getattr(self, name)) is not None and not np.all((0 < cone) & (cone <= np.pi)):
+            if (cone := getattr(self, name)) is not None and not np.all((cone > 0) & (cone <= np.pi)):
                 raise ValueError(f"Stewart.{name} must be in (0, pi] rad, got {np.asarray(cone).tolist()}")
         if self.cone_axes is not None and not np.allclose(
             np.linalg.norm(self.cone_axes, axis=-1), 1, rtol=0, atol=1e-6

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from pk_jax.kinematics.jacobian import pose_jacobian as pose_jacobian
     from pk_jax.kinematics.jacobian import velocity_jacobian as velocity_jacobian
     from pk_jax.kinematics.laws import check_mechanism as check_mechanism
+    from pk_jax.kinematics.track import Track as Track
+    from pk_jax.kinematics.track import track as track
     from pk_jax.mechanisms.base import LegMechanism as LegMechanism
     from pk_jax.mechanisms.base import Mechanism as Mechanism
     from pk_jax.mechanisms.base import Skeleton as Skeleton
@@ -84,6 +86,10 @@ _NAMES = {
         "velocity_jacobian",
     ),
     "pk_jax.kinematics.laws": ("check_mechanism",),
+    "pk_jax.kinematics.track": (
+        "Track",
+        "track",
+    ),
     "pk_jax.mechanisms.base": (
         "LegMechanism",
         "Mechanism",

@@ -1,6 +1,7 @@
 """pk-jax: parse, call one function, print or save.
 
-Exit codes: 0 good, 2 bad input, 4 file system, 5 numerical stop, 130 interrupted.
+Exit codes: 0 good, 2 bad input, 3 rows that are not OK (--strict), 4 file system, 5 numerical stop,
+130 interrupted.
 """
 
 from __future__ import annotations
@@ -8,19 +9,23 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import time
+import warnings
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-BAD_INPUT, FILE_SYSTEM, NUMERICAL, INTERRUPTED = 2, 4, 5, 130
+BAD_INPUT, NOT_OK, FILE_SYSTEM, NUMERICAL, INTERRUPTED = 2, 3, 4, 5, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     parser = _parser()
-    options = parser.parse_args(arguments)
+    options = parser.parse_args(_with_pose_joined(sys.argv[1:] if arguments is None else arguments))
     try:
-        return options.run(options)
+        with _plain_warnings(), _stopped_by_signals():
+            return options.run(options)
     except ValueError as error:
         return _fail(BAD_INPUT, str(error))
     except BrokenPipeError:  # the reader of our output has gone, e.g. `| head`
@@ -41,7 +46,117 @@ def _fail(code: int, message: str) -> int:
     return code
 
 
+@contextlib.contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Warnings in one line, each kind once."""
+    said = set()
+
+    def show(message, category, filename, lineno, *_):
+        if (filename, lineno) not in said:
+            said.add((filename, lineno))
+            print(f"pk-jax: warning: {message}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
+@contextlib.contextmanager
+def _stopped_by_signals() -> Iterator[None]:
+    """What ends the process otherwise ends it as Ctrl-C does: temporary files are taken away."""
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    before = {}
+    with contextlib.suppress(ValueError):  # signals belong to the main thread
+        for each in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(each) == signal.SIG_DFL:  # `nohup` ignores SIGHUP
+                before[each] = signal.signal(each, stop)
+    try:
+        yield
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+
+
 # --- the commands; jax is imported only when one runs
+
+
+def _forward(options: argparse.Namespace) -> int:
+    from pk_jax.files.stream import forward_rows
+
+    return _convert(options, forward_rows)
+
+
+def _inverse(options: argparse.Namespace) -> int:
+    from pk_jax.files.stream import inverse_rows
+
+    return _convert(options, inverse_rows)
+
+
+def _convert(options: argparse.Namespace, convert) -> int:
+    progress = _begin()
+    from pk_jax.files.named import named_mechanism
+
+    if options.chunk < 1:
+        raise ValueError(f"--chunk must be at least 1, got {options.chunk}")
+    begun = time.monotonic()
+    named = named_mechanism(options.mechanism, options.unit)
+    to_terminal = options.out in (None, "-") and sys.stdout.isatty()  # rows and progress would mix
+    try:
+        found = convert(
+            named,
+            options.rows,
+            options.out,
+            columns=options.columns,
+            chunk=options.chunk,
+            note=(lambda _: None) if to_terminal else progress.note,
+        )
+    finally:
+        progress.close()
+    seconds, count = time.monotonic() - begun, found.total()
+    each = ", ".join(f"{n} {name}" for name, n in found.most_common())
+    print(f"{count} rows: {each}; {seconds:.1f} s, {count / seconds:.0f} rows/s", file=sys.stderr)
+    return NOT_OK if options.strict and found["OK"] < count else 0
+
+
+def _jacobian(options: argparse.Namespace) -> int:
+    _begin()
+    from pk_jax.files.named import named_mechanism
+    from pk_jax.files.shown import as_json, as_text, jacobians_at
+
+    found = jacobians_at(named_mechanism(options.mechanism, options.unit), options.pose)
+    print(as_json(found) if options.json else as_text(found))
+    return 0
+
+
+def _draw(options: argparse.Namespace) -> int:
+    kind = Path(options.out).suffix.lower().removeprefix(".")
+    if kind not in ("png", "svg", "pdf"):
+        raise ValueError(f"-o must end in .png, .svg or .pdf, got {options.out!r}")
+    _begin()
+    from pk_jax.files.atomic import output_file
+    from pk_jax.files.named import named_mechanism
+    from pk_jax.files.shown import configuration_at
+    from pk_jax.viz.skeleton import draw
+
+    named = named_mechanism(options.mechanism, options.unit)
+    with output_file(options.out) as file:
+        pose, joints, _ = configuration_at(named, options.pose)
+        axes = draw(named.mechanism, pose, joints)
+        axes.set_title(Path(named.name).name)
+        axes.figure.savefig(file, format=kind, dpi=150)
+    return 0
+
+
+def _show(options: argparse.Namespace) -> int:
+    _begin()
+    from pk_jax.files.named import named_mechanism
+    from pk_jax.files.shown import describe
+
+    print(describe(named_mechanism(options.mechanism, options.unit)))
+    return 0
 
 
 def _reproduce(options: argparse.Namespace) -> int:
@@ -153,6 +268,15 @@ class _Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
+def _with_pose_joined(arguments: Sequence[str]) -> list[str]:
+    """`--pose -1,2` as `--pose=-1,2`, which argparse would take for an option."""
+    rest, joined = iter(arguments), []
+    for each in rest:
+        value = next(rest, None) if each == "--pose" else None
+        joined.append(each if value is None else f"{each}={value}")
+    return joined
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="pk-jax", description="Differentiable kinematics of parallel mechanisms.", allow_abbrev=False
@@ -183,6 +307,38 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--weights", type=float, nargs=3, default=(1.0, 1.0, 1.0), metavar=("GII", "GRI", "SUI"))
     sub.add_argument("--starts", type=int, default=12, help="number of starts (default: %(default)s)")
     sub.add_argument("--steps", type=int, default=100, help="most evaluations a start (default: %(default)s)")
+
+    named = "a catalogue entry (see: pk-jax list) or a TOML file"
+    unit = "of lengths: m, mm, cm, in or um (default: the file's own, m for a catalogue entry)"
+    for name, run, rows, text in (
+        ("fk", _forward, "joints", "forward kinematics of rows of joints (CSV in, CSV out)"),
+        ("ik", _inverse, "poses", "inverse kinematics of rows of poses (CSV in, CSV out)"),
+    ):
+        sub = command(name, run, text)
+        sub.add_argument("mechanism", help=named)
+        sub.add_argument(
+            "rows", metavar=f"{rows.upper()}.csv", help=f"file of {rows}, - for stdin; angles in rad"
+        )
+        sub.add_argument("-o", "--out", metavar="FILE", help="where to (default: stdout)")
+        sub.add_argument("--strict", action="store_true", help="exit code 3 where a row is not OK")
+        sub.add_argument(
+            "--columns", metavar="A,B,...", help=f"which columns are the {rows}: names or numbers"
+        )
+        sub.add_argument("--unit", help=unit)
+        sub.add_argument(
+            "--chunk", type=int, default=65536, metavar="N", help="rows at a time (default: %(default)s)"
+        )
+
+    printed = command("jacobian", _jacobian, "A, B and J of a configuration, in metres and radians")
+    printed.add_argument("--json", action="store_true", help="machine-readable")
+    drawn = command("draw", _draw, "draw a configuration")
+    drawn.add_argument("-o", "--out", required=True, metavar="FILE", help="a .png, .svg or .pdf")
+    shown = command("show", _show, "a mechanism: its fields, home, size and margins")
+    for sub in (printed, drawn, shown):
+        sub.add_argument("mechanism", help=named)
+        sub.add_argument("--unit", help=unit)
+        if sub is not shown:
+            sub.add_argument("--pose", metavar="X,Y,...", help="as a row of ik (default: home)")
 
     command("list", _list, "the catalogue of published designs")
     return parser

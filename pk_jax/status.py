@@ -16,5 +16,5 @@ class Status(enum.IntEnum):
     STALLED = 5  # the iteration stopped moving away from a solution
     STEP_LIMIT = 6  # the iteration was still moving when its steps ran out
     NONFINITE = 7  # NaN or infinity appeared on the way
-    INCOMPLETE = 8  # some solutions may be missing
+    INCOMPLETE = 8  # not reached, or some solutions may be missing
     BAD_INPUT = 9  # NaN, infinity, a negative length came in: there is no question to answer

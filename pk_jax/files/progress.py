@@ -18,12 +18,13 @@ class Progress:
 
     def __call__(self, what: str, done: int, total: int, best: float | None = None) -> None:
         """Say that `done` of at most `total` steps of `what` are done; `best` is the value so far."""
-        now = time.monotonic()
-        if now - self.shown < self.every and done < total:
-            return
-        self.shown = now
         value = "" if best is None else f"  best {best:.9g}"
-        self._line(f"{what}  {done}/{total}{value}  {now - self.started:.1f} s")
+        self.note(f"{what}  {done}/{total}{value}", is_last=done >= total)
+
+    def note(self, what: str, *, is_last: bool = False) -> None:
+        """Say how far it is, unless something was said just now."""
+        if is_last or time.monotonic() - self.shown >= self.every:
+            self.say(what)
 
     def say(self, what: str) -> None:
         """Say what begins now."""

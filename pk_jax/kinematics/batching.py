@@ -75,6 +75,12 @@ def all_finite(*trees: Any) -> jax.Array:
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(trees)]))
 
 
+def is_possible(mech: Mechanism, joints: jax.Array) -> jax.Array:
+    """() False for NaN, infinity, and distances that are not positive."""
+    positive = jnp.all(joints > 0) if mech.joints_are_distances else True
+    return all_finite(joints) & positive
+
+
 def where(condition: jax.Array, chosen: Any, other: Any) -> Any:
     """`jnp.where` for one row's pose of any kind; `other` may be one number."""
     if isinstance(other, float | int):

@@ -30,7 +30,7 @@ def joint_scale(mech: Mechanism, joints: jax.Array) -> jax.Array:
 def closure(
     mech: Mechanism, pose: Any, joints: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """F (c,), A (c, n), the size of the terms of each equation (c,), and that of its pose terms alone (c,)."""
+    """F (c,), A (c, n), the size of the terms of each equation (c,), and of those of its pose alone (c,)."""
     value, jacobian = mech.linearize(pose, joints)
     of_pose = jnp.abs(jacobian) @ pose_scale(mech, pose)
     of_joints = jnp.abs(joint_jacobian(mech, pose, joints)) @ joint_scale(mech, joints)

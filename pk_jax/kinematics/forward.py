@@ -18,6 +18,7 @@ from pk_jax.kinematics import lane_newton, newton, rows
 from pk_jax.kinematics.batching import (
     all_finite,
     home_shapes,
+    is_possible,
     over_rows,
     rows_of,
     same_size,
@@ -91,15 +92,20 @@ def _solve(mech, home, joints_and_guess, are_batched, order):
 
 def _one(mech: Mechanism, home: Home, order: Any, joints: jax.Array, guess: Any = None) -> ForwardKinematics:
     found = _locate(mech, home, order, joints, guess)
-    is_ok = found.status == Status.OK
+    return found._replace(pose=with_derivatives(mech, home.pose, joints, found.candidate, found.status))
+
+
+def with_derivatives(mech: Mechanism, home: Any, joints: jax.Array, pose: Any, status: jax.Array) -> Any:
+    """The pose of one row, differentiable in joints and geometry; NaN with derivatives 0 where not OK."""
+    is_ok = status == Status.OK
     home_joints = mech.home()[1]  # lost rows work at home and are masked after
-    pose = newton.implicit(
+    exact = newton.implicit(
         lambda x: mech.residual(x, jnp.where(is_ok, joints, home_joints)),
         retract,
-        where(is_ok, found.candidate, home.pose),
-        tangent_size(home.pose),
+        where(is_ok, pose, home),
+        tangent_size(home),
     )
-    return found._replace(pose=where(is_ok, pose, jnp.nan))
+    return where(is_ok, exact, jnp.nan)
 
 
 def _locate(mech: Mechanism, home: Home, order: Any, joints: jax.Array, guess: Any) -> ForwardKinematics:
@@ -160,9 +166,7 @@ def _persist(
     mech: Mechanism, home: Home, joints: jax.Array, guess: Any, found: ForwardKinematics
 ) -> ForwardKinematics:
     """A STALLED row again, by Levenberg-Marquardt; any other as it is."""
-    is_given = all_finite(joints) if guess is None else all_finite(joints, guess)
-    if mech.joints_are_distances:
-        is_given = is_given & jnp.all(joints > 0)
+    is_given = is_possible(mech, joints) & (True if guess is None else all_finite(guess))
     is_lost = (found.status == Status.STALLED) & is_given
     start = home.pose if guess is None else where(is_lost, guess, home.pose)
     q = jnp.where(is_lost, joints, home.joints)

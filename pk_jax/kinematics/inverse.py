@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +16,7 @@ from pk_jax.kinematics import newton
 from pk_jax.kinematics.batching import all_finite, home_shapes, over_rows, rows_of, where
 from pk_jax.kinematics.closure import is_closed, joint_scale
 from pk_jax.kinematics.jacobian import SINGULAR_BELOW, joint_jacobian, scaled_jacobians
+from pk_jax.kinematics.lanes import entrywise, is_known, split
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
 
@@ -37,10 +38,10 @@ def inverse_kinematics(
     branch:  signs of the working mode, (m,) or (batch, m); default: the mechanism's own
     free:    values of kinematically redundant joints, for mechanisms that have them
 
-    Status: OK; UNREACHABLE: no real joints; SINGULAR: a type I singularity (a leg stretched or
+    Status: OK: closed to roundoff; UNREACHABLE: no real joints; SINGULAR: a type I singularity (a leg stretched or
     folded), where the joints exist, in `candidate`, but their rates do not; BAD_INPUT: NaN or
-    infinity in the pose. Without a closed form the joints come from Newton, started at home
-    (STALLED where that ends elsewhere). BAD_INPUT also: a traced branch that holds no signs, or a
+    infinity in the pose; STALLED: joints that do not close the loops. Without a closed form they come
+    from Newton, started at home. BAD_INPUT also: a traced branch that holds no signs, or a
     traced rotation that is none.
     The derivative of a row that is not OK is zero.
     """
@@ -81,9 +82,11 @@ def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = No
     found = lax.stop_gradient(joints_at(lax.stop_gradient(pose)))
     is_real = all_finite(found)
     at = lax.stop_gradient(where(is_real, pose, home_pose))
-    jacobians = scaled_jacobians(lax.stop_gradient(mech), at, jnp.where(is_real, found, home_joints))
-    sigma = jnp.linalg.svd(jacobians.joints, compute_uv=False)[-1]
-    status = jnp.where(sigma < SINGULAR_BELOW, Status.SINGULAR, Status.OK)
+    q = jnp.where(is_real, found, home_joints)
+    sigma = least_joint_sigma(lax.stop_gradient(mech), at, q)
+    is_exact = is_closed(lax.stop_gradient(mech), at, q)
+    status = jnp.where(is_exact, Status.OK, Status.STALLED)
+    status = jnp.where(sigma < SINGULAR_BELOW, Status.SINGULAR, status)
     status = jnp.where(is_real, status, failed)
     status = jnp.where(is_given, status, Status.BAD_INPUT)
     status = jnp.where(is_mode, status, Status.BAD_INPUT).astype(jnp.int32)
@@ -91,6 +94,30 @@ def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = No
     is_ok = status == Status.OK
     joints = joints_at(where(is_ok, pose, home_pose))  # what is differentiated never sees a limit
     return InverseKinematics(jnp.where(is_ok, joints, jnp.nan), status, jnp.where(is_given, found, jnp.nan))
+
+
+def least_joint_sigma(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
+    """Least singular value of B without units (`scaled_jacobians`). -> ()"""
+    scaled = scaled_jacobians(mech, pose, joints).joints
+    leaves, tree = jax.tree.flatten((mech, pose, joints))
+    if _has_one_joint_a_leg(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves)):
+        return jnp.min(jnp.abs(jnp.diagonal(scaled)))
+    return jnp.linalg.svd(scaled, compute_uv=False)[-1]
+
+
+@lru_cache(maxsize=256)
+def _has_one_joint_a_leg(tree: Any, leaves: tuple) -> bool:
+    """Whether B is diagonal: its other entries are known zeros, whatever the values are."""
+    answer = []
+
+    def look(*leaves):
+        jacobian = entrywise(joint_jacobian, *jax.tree.unflatten(tree, list(map(split, leaves))))
+        c, m = jacobian.shape
+        off = [jacobian.items[i * m + j] for i in range(c) for j in range(m) if i != j]
+        answer.append(c == m and all(is_known(item) and item == 0 for item in off))
+
+    jax.eval_shape(look, *(jax.ShapeDtypeStruct(*leaf) for leaf in leaves))
+    return answer[0]
 
 
 def _by_newton(mech: Mechanism, pose: jax.Array) -> jax.Array:

@@ -80,9 +80,7 @@ def attempt(
         is_given = reduce(jnp.logical_and, finite, is_given)
         start = _where(is_given, start, home.pose)
     joints = _where(is_given, joints, home.joints)  # lost rows work at home and are masked after
-    by: Order | Reference | None = order
-    if order is None and home.square is not None:
-        by = Reference(home.square.rows(), home.sign.items[0])
+    by = eliminated_by(order, home)
     ended = iterate(mech, joints, start, by, home.first.rows() if is_home else None, home.first.shape[1])
     judged = judge(mech, joints, ended.pose, by, kind.actuated_rows)
     is_square = home.first.shape[0] == home.first.shape[1]
@@ -93,6 +91,13 @@ def attempt(
     status = verdict(judged, ended.is_stationary, side, is_square=is_square)
     status = jnp.where(is_given, status, Status.BAD_INPUT)
     return Attempt(ended.pose, status, judged.residual, ended.steps, judged.sigma_min, det_sign)
+
+
+def eliminated_by(order: Order | None, home: Home) -> Order | Reference | None:
+    """The order of pivots where it is known, else by the inverse at home; None for redundant actuation."""
+    if order is None and home.square is not None:
+        return Reference(home.square.rows(), home.sign.items[0])
+    return order
 
 
 def verdict(judged: Judged, is_stationary: Lane, side: Lane, *, is_square: bool) -> Lane:
@@ -247,6 +252,12 @@ def start_sign(mech: Any, joints: Entries, start: Any, by: Order | Reference, ac
     """Sign of det A at the start."""
     jacobian = entrywise(lambda m, x, q: m.linearize(x, q)[1], mech, start, joints)
     return elimination.factor(jacobian.rows()[:actuated], by).sign()
+
+
+def first_step(mech: Any, joints: Entries, start: Any, by: Order | Reference | None) -> list[Lane]:
+    """The first Newton step from the start, with the sign changed. -> (n,)"""
+    value, jacobian = entrywise(lambda m, x, q: m.linearize(x, q), mech, start, joints)
+    return _least_squares(jacobian.rows(), value.items, by)
 
 
 def _least_squares(rows: Matrix, value: list[Lane], by: Order | Reference | None) -> list[Lane]:

@@ -113,7 +113,7 @@ def solve(mech: Mechanism, joints: np.ndarray, guess: Any, *, one_guess: bool) -
 def _program(
     tree: Any, shapes: tuple, order: Order | None, start: str, block: int, joints: int, dtype: Any
 ) -> Callable:
-    """The compiled block: leaves of mechanism and home, joints, number of rows, guess -> (chunks, values, lanes)."""
+    """The compiled block: mechanism, home, joints, number of rows, guess -> (chunks, values, lanes)."""
     mech, home = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
     lanes = LANES if jax.default_backend() == "cpu" else block
     size = sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(home.pose))

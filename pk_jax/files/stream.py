@@ -1,0 +1,224 @@
+"""Forward and inverse kinematics of rows in a CSV file, chunk by chunk: files may be larger than memory."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+from pk_jax.files.atomic import output_file
+from pk_jax.files.columns import Column, Layout
+from pk_jax.files.named import Named
+from pk_jax.files.rows_file import CHUNK, format_rows, open_rows, parse_row
+from pk_jax.geometry import rotations
+from pk_jax.geometry.poses import pose_units
+from pk_jax.geometry.se3 import SE3
+from pk_jax.kinematics.batching import home_shapes
+from pk_jax.kinematics.forward import forward_kinematics
+from pk_jax.kinematics.inverse import inverse_kinematics
+from pk_jax.status import Status
+
+Solve = Callable[[Layout, np.ndarray], tuple[list[Any], np.ndarray]]  # -> columns to write, statuses
+
+_QUATERNION, _VECTOR = ("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")
+_KINDS = ("angle", "length")
+
+
+def forward_rows(named: Named, source: str, target: str | None, **options: Any) -> Counter[str]:
+    """Poses of the joints in `source`, written to `target`; see `_stream`."""
+    header = [c.name for c in output_layout(named)]
+    header += ["status", "residual", "steps", "sigma_min", "det_sign"]
+    solve = partial(_forward, named, _Padding())
+    return _stream(named, source, target, joint_layouts(named), header, solve, **options)
+
+
+def inverse_rows(named: Named, source: str, target: str | None, **options: Any) -> Counter[str]:
+    """Joints of the poses in `source`, written to `target`; see `_stream`."""
+    header = [c.name for c in joint_layouts(named)[0]] + ["status"]
+    solve = partial(_inverse, named, _Padding())
+    return _stream(named, source, target, pose_layouts(named), header, solve, **options)
+
+
+def _stream(
+    named: Named,
+    source: str,
+    target: str | None,
+    layouts: list[Layout],
+    header: list[str],
+    solve: Solve,
+    *,
+    columns: str | None = None,
+    chunk: int = CHUNK,
+    note: Callable[[str], None] = lambda _: None,
+) -> Counter[str]:
+    """Read, solve and write chunk by chunk; how many rows have which status.
+
+    `source` "-" is stdin, `target` None or "-" stdout; a target file appears whole at the end or not at all.
+    """
+    is_file = target not in (None, "-")
+    for name, path in (("input", source), ("mechanism", named.path)):
+        if is_file and path not in (None, "-") and _is_same(path, target):
+            raise ValueError(f"the output {target} is the {name} file: it must be another one")
+    found, begun = Counter(), time.monotonic()
+    with (
+        open_rows(source, layouts, unit=named.unit, columns=columns, chunk=chunk) as reader,
+        _output(target if is_file else None) as write,
+    ):
+        for rows in reader:
+            if not found:
+                write(",".join(header) + "\n")
+                note("compiling")
+            solved, status = solve(reader.layout, rows)
+            write(format_rows(solved))
+            found.update({Status(k).name: n for k, n in enumerate(np.bincount(status).tolist()) if n})
+            if reader.fraction != 1:  # then all is said at the end
+                done = found.total()
+                part = "" if reader.fraction is None else f" ({reader.fraction:.0%})"
+                note(f"{done} rows{part}  {done / (time.monotonic() - begun):.0f}/s")
+    return found
+
+
+@contextlib.contextmanager
+def _output(target: str | None) -> Iterator[Callable[[str], Any]]:
+    """Where text is written to; None: stdout."""
+    if target is None:
+        yield sys.stdout.write
+        sys.stdout.flush()
+        return
+    with output_file(target) as file:
+        yield lambda text: file.write(text.encode())
+
+
+def _is_same(first: str, second: str) -> bool:
+    with contextlib.suppress(OSError):
+        return os.path.samefile(os.path.expanduser(first), os.path.expanduser(second))
+    return False
+
+
+# What the columns are
+
+
+def joint_layouts(named: Named) -> list[Layout]:
+    """q1, ..., qm; or l1, ..., lm where all joints are lengths."""
+    units = named.mechanism.joint_units or (1,) * home_shapes(named.mechanism)[1].shape[0]
+    letters = "ql" if all(units) else "q"
+    return [tuple(Column(f"{a}{i}", _KINDS[u]) for i, u in enumerate(units, 1)) for a in letters]
+
+
+def pose_layouts(named: Named) -> list[Layout]:
+    """Position, then quaternion or rotation vector; or the coordinates of an array pose."""
+    layout = _position(named)
+    if not isinstance(home_shapes(named.mechanism)[0], SE3):
+        return [layout]
+    return [(*layout, *_numbers(_QUATERNION)), (*layout, *_angles(_VECTOR))]
+
+
+def output_layout(named: Named) -> Layout:
+    if not isinstance(home_shapes(named.mechanism)[0], SE3):
+        return _position(named)
+    return (*_position(named), *_numbers(_QUATERNION), *_angles(_VECTOR))
+
+
+def _position(named: Named) -> Layout:
+    pose = home_shapes(named.mechanism)[0]
+    if isinstance(pose, SE3):
+        return tuple(Column(name, "length") for name in "xyz")
+    units = pose_units(pose, named.mechanism.pose_units)
+    names = {2: ("x", "y"), 3: ("x", "y", "z" if all(units) else "phi")}.get(len(units))
+    names = names or [f"p{i}" for i in range(1, len(units) + 1)]
+    return tuple(Column(name, _KINDS[u]) for name, u in zip(names, units, strict=True))
+
+
+def _numbers(names: tuple[str, ...]) -> Layout:
+    return tuple(Column(name, "number") for name in names)
+
+
+def _angles(names: tuple[str, ...]) -> Layout:
+    return tuple(Column(name, "angle") for name in names)
+
+
+# Rows in units of the user, and the solvers
+
+
+def pose_of(named: Named, text: str) -> Any:
+    """The pose that `--pose` says, as a row of `ik`."""
+    layout, row = parse_row("--pose", text, pose_layouts(named))
+    return jax.tree.map(lambda leaf: leaf[0], _as_pose(named, layout, row[None]))
+
+
+def pose_columns(named: Named, pose: Any) -> list[np.ndarray]:
+    """The numbers of a batch of poses, in the unit of the user."""
+    if not isinstance(pose, SE3):
+        return [*np.asarray(pose).T / _scale(named, _position(named))[:, None]]
+    quaternion, vector = map(np.asarray, _from_rotation(pose.rotation))
+    quaternion = np.where(quaternion[:, :1] < 0, -quaternion, quaternion)
+    return [*np.asarray(pose.translation).T / named.metres, *quaternion.T, *vector.T]
+
+
+def joints_columns(named: Named, joints: Any) -> list[np.ndarray]:
+    """The numbers of a batch of joints, in the unit of the user."""
+    return [*np.asarray(joints).T / _scale(named, joint_layouts(named)[0])[:, None]]
+
+
+def _forward(named: Named, pad: _Padding, layout: Layout, rows: np.ndarray) -> tuple[list[Any], np.ndarray]:
+    found = forward_kinematics(named.mechanism, rows * _scale(named, layout))
+    poses = jax.tree.map(lambda leaf: pad(np.asarray(leaf)), found.pose)
+    numbers = [column[: len(rows)] for column in pose_columns(named, poses)]
+    status, residual, steps, sigma, signs = (np.asarray(each) for each in found[1:6])
+    signs = [f"{sign:.0f}" for sign in signs.tolist()]
+    return [*numbers, _names(status), residual, steps, sigma, signs], status
+
+
+def _inverse(named: Named, pad: _Padding, layout: Layout, rows: np.ndarray) -> tuple[list[Any], np.ndarray]:
+    found = inverse_kinematics(named.mechanism, _as_pose(named, layout, pad(rows)))
+    joints, status = np.asarray(found.joints)[: len(rows)], np.asarray(found.status)[: len(rows)]
+    return [*joints_columns(named, joints), _names(status)], status
+
+
+def _as_pose(named: Named, layout: Layout, rows: np.ndarray) -> Any:
+    rows = rows * _scale(named, layout)
+    if not isinstance(home_shapes(named.mechanism)[0], SE3):
+        return rows
+    if len(layout) == 6:
+        return _from_vector(rows[:, :3], rows[:, 3:])
+    size = np.abs(rows[:, 3:]).max(axis=1, keepdims=True)
+    with np.errstate(invalid="ignore"):  # a quaternion of zero length is no rotation: NaN, BAD_INPUT
+        return _from_quaternion(rows[:, :3], rows[:, 3:] / size)
+
+
+_from_quaternion = jax.jit(SE3.from_quaternion)
+_from_vector = jax.jit(SE3.from_rotation_vector)
+
+
+@jax.jit
+def _from_rotation(rotation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return jax.vmap(rotations.to_quaternion)(rotation), jax.vmap(rotations.to_rotation_vector)(rotation)
+
+
+def _scale(named: Named, layout: Layout) -> np.ndarray:
+    return np.array([named.metres if column.kind == "length" else 1.0 for column in layout])
+
+
+class _Padding:
+    """Fills batches up to a power of two, never a smaller one than before, so that few sizes are compiled."""
+
+    def __init__(self) -> None:
+        self.size = 2
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        self.size = max(self.size, 1 << (len(rows) - 1).bit_length())
+        extra = np.broadcast_to(rows[-1:], (self.size - len(rows), *rows.shape[1:]))
+        return np.concatenate([rows, extra])
+
+
+def _names(status: np.ndarray) -> list[str]:
+    names = [each.name for each in Status]
+    return [names[k] for k in status.tolist()]

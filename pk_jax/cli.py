@@ -146,6 +146,10 @@ def _draw(options: argparse.Namespace) -> int:
         pose, joints, _ = configuration_at(named, options.pose)
         axes = draw(named.mechanism, pose, joints)
         axes.set_title(Path(named.name).name)
+        if named.path and named.unit != "1":  # those of the catalogue are over a length of reference
+            for name in "xyz":
+                if hasattr(axes, f"set_{name}label"):
+                    getattr(axes, f"set_{name}label")(f"${name}$ (m)")
         axes.figure.savefig(file, format=kind, dpi=150)
     return 0
 

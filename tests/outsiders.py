@@ -2,53 +2,20 @@
 
 from __future__ import annotations
 
+import importlib.util
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 import pk_jax as pk
 
-
-class Delta(pk.Mechanism):
-    """Three driven arms and three rods hold a platform that only translates. No closed form."""
-
-    base_radius: jax.Array
-    platform_radius: jax.Array
-    arm: jax.Array
-    rod: jax.Array
-
-    joint_units = (0, 0, 0)
-
-    def radial(self):
-        """Horizontal direction of every arm. -> (3, 3)"""
-        angles = 2 * jnp.pi / 3 * jnp.arange(3)
-        return jnp.stack([jnp.cos(angles), jnp.sin(angles), jnp.zeros(3)], axis=1)
-
-    def elbows(self, joints):
-        out = self.base_radius + self.arm * jnp.cos(joints)
-        down = jnp.zeros((3, 3)).at[:, 2].set(self.arm * jnp.sin(joints))
-        return out[:, None] * self.radial() - down
-
-    def residual(self, pose, joints):
-        rods = pose + self.platform_radius * self.radial() - self.elbows(joints)
-        return jnp.sum(rods**2, axis=1) - self.rod**2
-
-    def home(self):
-        across = self.base_radius + self.arm - self.platform_radius
-        depth = jnp.sqrt(self.rod**2 - across**2)
-        return lax.stop_gradient(jnp.array([0.0, 0.0, -1.0]) * depth), jnp.zeros(3)
-
-    def length(self):
-        return self.rod
-
-    def margins(self, pose, joints):
-        return {"arms": 1 - jnp.abs(joints) / (jnp.pi / 2)}
-
-    def skeleton(self, pose, joints):
-        base, platform = self.base_radius * self.radial(), pose + self.platform_radius * self.radial()
-        points = jnp.concatenate([base, self.elbows(joints), platform])
-        bars = tuple((i, i + 3) for i in range(6))
-        return pk.Skeleton(points, bars, ground=(0, 1, 2))
+_EXAMPLE = Path(__file__).parent.parent / "examples" / "delta.py"
+_spec = importlib.util.spec_from_file_location("delta_example", _EXAMPLE)
+_module = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(_module)
+Delta = _module.Delta
 
 
 class ThreeRPR(pk.LegMechanism):

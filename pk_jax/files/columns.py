@@ -9,8 +9,6 @@ import numpy as np
 
 from pk_jax.files.mechanism_file import UNITS
 
-_NO_UNIT = ("1", "")
-
 
 class Column(NamedTuple):
     """What is looked for: a name, and what its numbers are, "length", "angle" or "number"."""
@@ -30,9 +28,12 @@ def arrange(
     names = [field.strip() for field in fields]
     if chosen is not None:
         layout = _of_length(f"{where}: --columns", len(chosen), layouts)
-        return layout, [
-            _place(where, key, names, column, unit) for key, column in zip(chosen, layout, strict=True)
-        ]
+        at = [_place(where, key, names, column, unit) for key, column in zip(chosen, layout, strict=True)]
+        if len(set(at)) < len(at):
+            raise ValueError(
+                f"{where}: --columns: must not name a column twice, got {short(','.join(chosen))}"
+            )
+        return layout, at
     for layout in layouts:
         found = [
             [i for i, name in enumerate(names) if _stem(name, column) == column.name] for column in layout
@@ -64,6 +65,10 @@ def _of_length(where: str, count: int, layouts: Sequence[Layout]) -> Layout:
 
 def _place(where: str, key: str, names: list[str], column: Column, unit: str) -> int:
     """Where a column stands that was chosen by its name or its number, counted from 1."""
+    if key.isascii() and key.isdigit():  # never a name: it may be a number of the first row
+        if not 1 <= int(key) <= len(names):
+            raise ValueError(f"{where}: --columns: there are columns 1 to {len(names)}, got {key}")
+        return int(key) - 1
     if key in names:
         if names.count(key) > 1:
             raise ValueError(
@@ -71,10 +76,6 @@ def _place(where: str, key: str, names: list[str], column: Column, unit: str) ->
             )
         _check_unit(where, key, column, unit)
         return names.index(key)
-    if key.isascii() and key.isdigit():
-        if not 1 <= int(key) <= len(names):
-            raise ValueError(f"{where}: --columns: there are columns 1 to {len(names)}, got {key}")
-        return int(key) - 1
     raise ValueError(f"{where}: --columns: no column {key!r} among {short(','.join(names))}")
 
 
@@ -93,7 +94,7 @@ def _check_unit(where: str, name: str, column: Column, unit: str) -> None:
         return
     in_use = "rad" if column.kind == "angle" else unit
     if suffix != in_use:
-        said = "lengths without a unit" if in_use in _NO_UNIT else f"{column.kind}s in {in_use}"
+        said = "lengths without a unit" if in_use == "1" else f"{column.kind}s in {in_use}"
         hint = "" if column.kind == "angle" else " (see --unit)"
         raise ValueError(f"{where}: column {name!r} is in {suffix}, but what is read are {said}{hint}")
 

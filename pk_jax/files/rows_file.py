@@ -80,29 +80,28 @@ class RowReader:
     def _first(self) -> bytes:
         """The first line that says something."""
         for line in self._lines:
-            line = line.removeprefix(_BOM) if self.line == 0 else line
             self.line, self.seen = self.line + 1, self.seen + len(line)
+            line = line.removeprefix(_BOM) if self.line == 1 else line
             if not _is_skipped(line):
                 return line
         raise ValueError(f"{self.name}: there are no rows of numbers")
 
     def _is_header(self, fields: list[str]) -> bool:
         """Whether the first line names its columns; ValueError where it does half of it."""
-        arenumbers = [is_number(fields[i]) for i in self.at]
-        if any(arenumbers):
+        found = [is_number(fields[i]) for i in self.at]
+        if any(found):
             for i in self.at:  # names and numbers: the row is wrong, and not to be skipped
                 self._number(fields[i], i, self.line)
-        return not all(arenumbers)
+        return not all(found)
 
     def _take(self) -> list[bytes]:
         lines = self._waiting
         self._first_line = self.line + 1 - len(lines)
         more = list(islice(self._lines, self.chunk - len(lines)))
         self._waiting = []
-        for number, line in enumerate(
-            more if max(map(len, more), default=0) > LONGEST else [], self.line + 1
-        ):
-            self._split(line, number)  # told there
+        if max(map(len, more), default=0) > LONGEST:
+            for number, line in enumerate(more, self.line + 1):
+                self._split(line, number)  # told there
         self.line += len(more)
         self.seen += sum(map(len, more))
         return lines + more

@@ -1,62 +1,78 @@
-"""Compiling for the CPU with the options of XLA that pay for lanes.
+"""Compiling with the options of XLA that pay for lanes.
 
-By default XLA evaluates shared values again for each output of a fusion (six times the arithmetic, for
-a Newton step) and starts every fusion of a loop's body by itself. Two options end that; they would slow
-other programs down, and `jax.jit` passes on neither, so they are set for these programs alone.
+On a CPU, XLA evaluates shared values again for each output of a fusion (six times the arithmetic, for a
+Newton step) and starts every fusion of a loop's body by itself. Two backend options end that. They
+would slow other programs down, and `jax.jit` passes on neither, so they are set for these programs alone,
+through what `jax.extend` gives. Where that fails, the program is compiled the ordinary way: slower, as right.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 from jax.extend import backend
 
-_WIDTH = "xla_cpu_prefer_vector_width"
-_EXTRA = {
-    "xla_cpu_use_multi_output_fusion": "true",
-    "xla_cpu_small_while_loop_byte_threshold": "1000000000",
-}
+
+class Options(NamedTuple):
+    """How a program of lanes is compiled."""
+
+    width: int | None  # xla_cpu_prefer_vector_width, bits
+    extra: dict[str, str]  # xla_backend_extra_options
+    lanes: int  # of a chunk: as many as keep the intermediate values in the cache
 
 
-def compiled(function: Callable, arguments: Any) -> Callable[[Sequence[jax.Array]], Sequence[jax.Array]]:
+PLAIN = Options(None, {}, 512)
+WIDE = Options(512, {}, 512)
+FULL = Options(
+    512,
+    {"xla_cpu_use_multi_output_fusion": "true", "xla_cpu_small_while_loop_byte_threshold": "1000000000"},
+    64,
+)
+
+
+def compiled(
+    function: Callable, arguments: Any, options: Options = FULL
+) -> Callable[[Sequence[jax.Array]], Sequence[jax.Array]]:
     """`function(*arguments)` compiled for arguments of these shapes: leaves in, leaves out."""
     lowered = jax.jit(function, keep_unused=True).lower(*arguments)
-    if jax.default_backend() == "cpu":
+    is_cpu = jax.default_backend() == "cpu"
+    if is_cpu and options.extra:
         try:
-            return _with_extra_options(lowered)
-        except Exception:  # what this needs of jaxlib is no promise of theirs: slower, and as right
-            program = lowered.compile(compiler_options={_WIDTH: 512})
-    else:
-        program = lowered.compile()
+            return _with_extra_options(lowered, options)
+        except Exception:  # what this needs of jaxlib is no promise of theirs
+            pass
+    width = {"xla_cpu_prefer_vector_width": options.width} if is_cpu and options.width else None
+    program = lowered.compile(compiler_options=width)
     tree = jax.tree.structure(tuple(arguments))
     return lambda leaves: jax.tree.leaves(program(*jax.tree.unflatten(tree, leaves)))
 
 
-def _with_extra_options(lowered: Any) -> Callable:
+def _with_extra_options(lowered: Any, options: Options) -> Callable:
     from jaxlib import _jax
 
     client = backend.get_backend()
-    options = backend.get_compile_options(num_replicas=1, num_partitions=1)
-    options = type(options).ParseFromString(options.SerializeAsString() + _extra_options())
-    options.env_option_overrides = [(_WIDTH, 512)]
+    build = backend.get_compile_options(num_replicas=1, num_partitions=1)
+    build = type(build).ParseFromString(build.SerializeAsString() + _serialized(options.extra))
+    build.env_option_overrides = [("xla_cpu_prefer_vector_width", options.width)]
     device = _jax.DeviceList((jax.devices()[0],))
-    program = client.compile_and_load(str(lowered.compiler_ir("stablehlo")), device, options)
-    return program.execute
+    return client.compile_and_load(str(lowered.compiler_ir("stablehlo")), device, build).execute
 
 
-def _extra_options() -> bytes:
-    """CompileOptions.executable_build_options.debug_options.xla_backend_extra_options, serialized.
+def _serialized(extra: dict[str, str]) -> bytes:
+    """CompileOptions.executable_build_options.debug_options.xla_backend_extra_options as protocol buffer.
 
     Appended to a serialized message, it is merged into it.
     """
-    entries = b"".join(_field(500, _field(1, k.encode()) + _field(2, v.encode())) for k, v in _EXTRA.items())
-    return _field(3, _field(3, entries))
+    entries = (
+        _field(500, _field(1, key.encode()) + _field(2, value.encode())) for key, value in extra.items()
+    )
+    return _field(3, _field(3, b"".join(entries)))
 
 
 def _field(number: int, content: bytes) -> bytes:
-    """A length-delimited field of a protocol buffer."""
+    """A length-delimited field."""
     return _varint(number << 3 | 2) + _varint(len(content)) + content
 
 

@@ -38,10 +38,10 @@ def inverse_kinematics(
     branch:  signs of the working mode, (m,) or (batch, m); default: the mechanism's own
     free:    values of kinematically redundant joints, for mechanisms that have them
 
-    Status: OK: closed to roundoff; UNREACHABLE: no real joints; SINGULAR: a type I singularity (a leg stretched or
-    folded), where the joints exist, in `candidate`, but their rates do not; BAD_INPUT: NaN or
-    infinity in the pose; STALLED: joints that do not close the loops. Without a closed form they come
-    from Newton, started at home. BAD_INPUT also: a traced branch that holds no signs, or a
+    Status: OK: closed to roundoff; UNREACHABLE: no real joints; SINGULAR: a type I singularity (a leg
+    stretched or folded), where the joints exist, in `candidate`, but their rates do not; BAD_INPUT:
+    NaN or infinity in the pose; STALLED: joints that do not close the loops. Without a closed form
+    they come from Newton, started at home. BAD_INPUT also: a traced branch that holds no signs, or a
     traced rotation that is none.
     The derivative of a row that is not OK is zero.
     """

@@ -225,7 +225,8 @@ _ARITHMETIC: dict[str, Callable] = {
 _ELEMENTWISE = frozenset((
     "abs", "acos", "acosh", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil", "clamp",
     "convert_element_type", "cos", "cosh", "eq", "erf", "exp", "exp2", "expm1", "floor", "ge", "gt",
-    "is_finite", "le", "log", "log1p", "logistic", "lt", "max", "min", "ne", "not", "or", "pow", "rem", "round", "rsqrt",
+    "is_finite", "le", "log", "log1p", "logistic", "lt", "max", "min", "ne", "not", "or", "pow", "rem",
+    "round", "rsqrt",
     "select_n", "sign", "sin", "sinh", "sqrt", "stop_gradient", "tan", "tanh", "xor",
 ))
 # fmt: on

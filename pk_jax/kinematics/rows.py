@@ -16,13 +16,12 @@ from jax import lax
 
 from pk_jax import checks
 from pk_jax.kinematics.batching import home_shapes
-from pk_jax.kinematics.compiled import compiled
+from pk_jax.kinematics.compiled import FULL, Options, compiled
 from pk_jax.kinematics.elimination import Order
 from pk_jax.kinematics.lane_newton import Attempt, Home, at_home, attempt, home_from, order_of
 from pk_jax.kinematics.lanes import Entries, split, split_rows
 from pk_jax.mechanisms.base import Mechanism
 
-LANES = 64  # of a chunk on a CPU: its few hundred intermediate values stay in the cache
 BLOCK = 4096  # rows of one call; on an accelerator they are the lanes, all at once
 ON_ACCELERATOR = 1 << 16
 
@@ -70,14 +69,16 @@ def prepared(mech: Mechanism) -> Prepared:
 _at_home = jax.jit(at_home)
 
 
-def solve(mech: Mechanism, joints: np.ndarray, guess: Any, *, one_guess: bool) -> Rows:
+def solve(
+    mech: Mechanism, joints: np.ndarray, guess: Any, *, one_guess: bool, options: Options = FULL
+) -> Rows:
     """The first attempt at every row. joints (batch, m); guess: None, one pose, or one a row."""
     ready = prepared(mech)
     count, dtype = joints.shape[0], joints.dtype
     start = "home" if guess is None else "one" if one_guess else "rows"
     block = BLOCK if jax.default_backend() == "cpu" else ON_ACCELERATOR
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in ready.leaves)
-    program = _program(ready.tree, shapes, ready.order, start, block, joints.shape[1], dtype)
+    program = _program(ready.tree, shapes, ready.order, start, block, joints.shape[1], dtype, options)
     pose_leaves, pose_tree = jax.tree.flatten(ready.shapes[0])
     poses = [_aligned((count, *leaf.shape), dtype) for leaf in pose_leaves]
     numbers = [
@@ -111,11 +112,18 @@ def solve(mech: Mechanism, joints: np.ndarray, guess: Any, *, one_guess: bool) -
 
 @lru_cache(maxsize=64)
 def _program(
-    tree: Any, shapes: tuple, order: Order | None, start: str, block: int, joints: int, dtype: Any
+    tree: Any,
+    shapes: tuple,
+    order: Order | None,
+    start: str,
+    block: int,
+    joints: int,
+    dtype: Any,
+    options: Options,
 ) -> Callable:
     """The compiled block: mechanism, home, joints, number of rows, guess -> (chunks, values, lanes)."""
     mech, home = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
-    lanes = LANES if jax.default_backend() == "cpu" else block
+    lanes = options.lanes if jax.default_backend() == "cpu" else block
     size = sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(home.pose))
     given = [jax.ShapeDtypeStruct((block, joints), dtype), jax.ShapeDtypeStruct((), jnp.int32)]
     if start != "home":
@@ -137,7 +145,7 @@ def _program(
         out = jnp.zeros((chunks, size + len(Rows._fields) - 1, lanes), dtype)
         return lax.fori_loop(0, jnp.minimum((count + lanes - 1) // lanes, chunks), chunk, out)
 
-    return compiled(solve_block, (mech, home, *given))
+    return compiled(solve_block, (mech, home, *given), options)
 
 
 def values_of(found: Attempt, dtype: Any) -> jax.Array:

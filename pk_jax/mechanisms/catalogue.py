@@ -5,11 +5,57 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
 from pk_jax.mechanisms.base import Mechanism
 from pk_jax.mechanisms.five_bar import FiveBar
+from pk_jax.mechanisms.stewart import Stewart
 from pk_jax.mechanisms.two_rpr import TwoRPR
 
 _NAM = "Nam, Lee and Park 2006, Trans. KSME A 30(11)"
+
+
+_INCH, _MM = 0.0254, 1e-3
+
+
+def _hexapod_log() -> Stewart:
+    base = [
+        [124.762, 32.11, 39.656],
+        [-34.524, 123.974, 39.655],
+        [-90.537, 91.909, 39.654],
+        [-90.15, -92.096, 39.657],
+        [-34.687, -124.359, 39.655],
+        [124.665, -32.552, 39.655],
+    ]
+    platform = [
+        [57.844, 70.715, -25.602],
+        [32.128, 85.518, -25.602],
+        [-90.266, 14.421, -25.603],
+        [-90.216, -15.174, -25.601],
+        [32.637, -85.55, -25.603],
+        [57.865, -70.593, -25.603],
+    ]
+    return Stewart(base=_MM * np.array(base), platform=_MM * np.array(platform))
+
+
+def _linuxcnc() -> Stewart:
+    corners = np.array([[-22.95, 13.25, 0], [22.95, 13.25, 0], [0, -26.5, 0]])
+    platform = [
+        [-1, 11.5, 0],
+        [1, 11.5, 0],
+        [10.459, -4.884, 0],
+        [9.459, -6.616, 0],
+        [-9.459, -6.616, 0],
+        [-10.459, -4.884, 0],
+    ]
+    return Stewart(base=_INCH * corners[[0, 1, 1, 2, 2, 0]], platform=_INCH * np.array(platform))
+
+
+def _calibration_nominal() -> Stewart:
+    base = [[305.4001, 111.1565, 0], [-56.4357, 320.0625, 0], [-248.9644, 208.906, 0]]
+    platform = [[92.1597, 84.4488, 0], [27.055, 122.037, 0], [-119.2146, 37.5882, 0]]
+    mirrored = lambda points: _MM * np.array(points + [[x, -y, z] for x, y, z in reversed(points)])
+    return Stewart(base=mirrored(base), platform=mirrored(platform))
 
 
 class Entry(NamedTuple):
@@ -31,6 +77,28 @@ CATALOGUE: dict[str, Entry] = {
     "nam-2-rrr-isotropic": Entry(
         lambda: FiveBar(half_base=1.0, proximal=1.39, distal=2.69, reach=(2.08, 4.08)),
         f"{_NAM}, Table 2, weights (1, 0, 0); lengths over R",
+    ),
+    "semi-regular-stewart": Entry(
+        lambda: Stewart.semi_regular(1.0, 0.45368859, np.deg2rad(12.0), np.deg2rad(9.52)),
+        "joints in pairs on circles of radius 1 and 0.454 (on the edges of a triangle of side 1, at 0.85)",
+    ),
+    "wide-semi-regular-stewart": Entry(
+        lambda: Stewart.semi_regular(1.0, 0.7, np.deg2rad(20.0), np.deg2rad(15.0)),
+        "joints in pairs, 20 and 15 degrees off their middles, on circles of radius 1 and 0.7",
+    ),
+    "hexapod-log": Entry(
+        _hexapod_log,
+        "36 parameters identified from the controller's log of github.com/legendryflyer/"
+        "Forward-Kinematic-Algorithm-for-Real-Time-Control-of-General-Six-Degree-of-Freedom-Parallel-Robot "
+        "(MIT, (c) 2026 Tavish Anade)",
+    ),
+    "linuxcnc-hexapod": Entry(
+        _linuxcnc, "default geometry of LinuxCNC's genhexkins (inches there): base joints in three pairs"
+    ),
+    "calibration-hexapod": Entry(
+        _calibration_nominal,
+        "hexapod machine tool, nominal geometry of the 42-parameter calibration benchmark "
+        "(Masory, Wang and Zhuang)",
     ),
 }
 

@@ -66,7 +66,7 @@ def test_fk_of_measured_rows(run, here):
     (here / "l.csv").write_text(f"t,l1_mm,l2_mm,l3_mm,l4_mm,l5_mm,l6_mm\n0,{ROW}\n1,nan{ROW[7:]}\n2,{ROW}\n")
     code, out, err = run("fk", HEXAPOD, "l.csv")
     found = table(out)
-    assert code == 0 and list(found)[:10] == "x y z qw qx qy qz rx ry rz".split()
+    assert code == 0 and list(found)[:10] == ["x", "y", "z", "qw", "qx", "qy", "qz", "rx", "ry", "rz"]
     assert list(found)[10:] == ["status", "residual", "steps", "sigma_min", "det_sign"]
     assert found["status"] == ["OK", "BAD_INPUT", "OK"]
     assert "3 rows: 2 OK, 1 BAD_INPUT;" in err
@@ -218,10 +218,13 @@ def test_strict(run, here):
     assert table((here / "b.csv").read_text())["status"] == ["OK", "UNREACHABLE"]
 
 
+@pytest.mark.filterwarnings("default")
 def test_lengths_in_another_unit_are_warned_of_in_one_line(run, here):
-    (here / "a.csv").write_text("2000,2000\n")
-    with pytest.warns(UserWarning, match=""):
-        pk.forward_kinematics(pk.TwoRPR(half_base=1.0, l_min=1.0, l_max=3.0), np.array([[2000.0, 9000.0]]))
+    (here / "a.csv").write_text("2000,9000\n" * 20)
+    code, out, err = run("fk", "nam-2-rpr", "a.csv", "--chunk", "8")
+    told = [line for line in err.splitlines() if "are they in its unit?" in line]
+    assert code == 0 and out.count("UNREACHABLE") == 20
+    assert len(told) == 1 and told[0].startswith("pk-jax: warning: joints are")
 
 
 # What is wrong
@@ -373,12 +376,12 @@ def test_jacobian_at_home(run):
     assert found["unit"] == "mm" and 150 < found["joints"]["q1"] < 151
     a, b, j = (np.array(found[k]) for k in "abj")
     np.testing.assert_allclose(a @ j, -b, atol=1e-12)
-    assert list(found["pose"]) == "x y z qw qx qy qz rx ry rz".split()
+    assert list(found["pose"]) == ["x", "y", "z", "qw", "qx", "qy", "qz", "rx", "ry", "rz"]
 
 
 def test_jacobian_of_a_stretched_leg(run, here, five_bar):
     """A type I singularity: A and B are there, and said to be singular."""
-    code, out, _ = run("jacobian", five_bar, "--pose", f"{100 + 139 + 269},0", "--json")
+    code, out, _ = run("jacobian", five_bar, "--pose", f"-50,{np.sqrt((139 + 269) ** 2 - 150**2)}", "--json")
     found = json.loads(out)
     assert code == 0 and found["status"] == "SINGULAR" and found["sigma_b"] < 1e-6
 

@@ -19,15 +19,15 @@ class Options(NamedTuple):
     """How a program of lanes is compiled."""
 
     width: int | None  # xla_cpu_prefer_vector_width, bits
-    extra: dict[str, str]  # xla_backend_extra_options
+    extra: tuple[tuple[str, str], ...]  # xla_backend_extra_options
     lanes: int  # of a chunk: as many as keep the intermediate values in the cache
 
 
-PLAIN = Options(None, {}, 512)
-WIDE = Options(512, {}, 512)
+PLAIN = Options(None, (), 512)
+WIDE = Options(512, (), 512)
 FULL = Options(
     512,
-    {"xla_cpu_use_multi_output_fusion": "true", "xla_cpu_small_while_loop_byte_threshold": "1000000000"},
+    (("xla_cpu_use_multi_output_fusion", "true"), ("xla_cpu_small_while_loop_byte_threshold", "1000000000")),
     64,
 )
 
@@ -60,7 +60,7 @@ def _with_extra_options(lowered: Any, options: Options) -> Callable:
     return client.compile_and_load(str(lowered.compiler_ir("stablehlo")), device, build).execute
 
 
-def _serialized(extra: dict[str, str]) -> bytes:
+def _serialized(extra: tuple[tuple[str, str], ...]) -> bytes:
     """CompileOptions.executable_build_options.debug_options.xla_backend_extra_options as protocol buffer.
 
     Appended to a serialized message, it is merged into it.

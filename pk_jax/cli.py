@@ -235,8 +235,9 @@ def _mechanism(options: argparse.Namespace):
 def _list(options: argparse.Namespace) -> int:
     from pk_jax.mechanisms.catalogue import CATALOGUE
 
+    width = max(map(len, CATALOGUE)) + 2
     for name, entry in CATALOGUE.items():
-        print(f"{name:22}{entry.source}")
+        print(f"{name:{width}}{entry.source}")
     return 0
 
 

@@ -38,26 +38,28 @@ def compiled(
     """`function(*arguments)` compiled for arguments of these shapes: leaves in, leaves out."""
     lowered = jax.jit(function, keep_unused=True).lower(*arguments)
     is_cpu = jax.default_backend() == "cpu"
-    if is_cpu and options.extra:
-        try:
-            return _with_extra_options(lowered, options)
-        except Exception:  # what this needs of jaxlib is no promise of theirs
-            pass
+    if is_cpu and options.extra and (program := with_extra_options(lowered, options)) is not None:
+        return program
     width = {"xla_cpu_prefer_vector_width": options.width} if is_cpu and options.width else None
     program = lowered.compile(compiler_options=width)
     tree = jax.tree.structure(tuple(arguments))
     return lambda leaves: jax.tree.leaves(program(*jax.tree.unflatten(tree, leaves)))
 
 
-def _with_extra_options(lowered: Any, options: Options) -> Callable:
-    from jaxlib import _jax
+def with_extra_options(lowered: Any, options: Options) -> Callable | None:
+    """Compiled by the client itself; None where this jaxlib does not let us."""
+    extra = _serialized(options.extra)
+    try:  # only calls that jaxlib makes no promise of
+        from jaxlib._jax import DeviceList
 
-    client = backend.get_backend()
-    build = backend.get_compile_options(num_replicas=1, num_partitions=1)
-    build = type(build).ParseFromString(build.SerializeAsString() + _serialized(options.extra))
-    build.env_option_overrides = [("xla_cpu_prefer_vector_width", options.width)]
-    device = _jax.DeviceList((jax.devices()[0],))
-    return client.compile_and_load(str(lowered.compiler_ir("stablehlo")), device, build).execute
+        client = backend.get_backend()
+        build = backend.get_compile_options(num_replicas=1, num_partitions=1)
+        build = type(build).ParseFromString(build.SerializeAsString() + extra)
+        build.env_option_overrides = [("xla_cpu_prefer_vector_width", options.width)]
+        devices = DeviceList((jax.devices()[0],))
+        return client.compile_and_load(str(lowered.compiler_ir("stablehlo")), devices, build).execute
+    except (ImportError, AttributeError, TypeError, jax.errors.JaxRuntimeError):
+        return None
 
 
 def _serialized(extra: tuple[tuple[str, str], ...]) -> bytes:
@@ -65,9 +67,7 @@ def _serialized(extra: tuple[tuple[str, str], ...]) -> bytes:
 
     Appended to a serialized message, it is merged into it.
     """
-    entries = (
-        _field(500, _field(1, key.encode()) + _field(2, value.encode())) for key, value in extra.items()
-    )
+    entries = (_field(500, _field(1, key.encode()) + _field(2, value.encode())) for key, value in extra)
     return _field(3, _field(3, b"".join(entries)))
 
 

@@ -227,20 +227,20 @@ def _known(mech: Mechanism, joints: Any, guess: Any) -> ForwardKinematics:
     elif guesses:
         joints = np.broadcast_to(joints, (jax.tree.leaves(guess)[0].shape[0], *joints.shape))
     solved = rows.solve(mech, joints, guess, one_guess=not guesses)
-    is_bad, is_wrong = solved.status == Status.BAD_INPUT, solved.status != Status.OK
-    found = ForwardKinematics(_blanked(solved.pose, is_wrong), *solved[1:], _blanked(solved.pose, is_bad))
-    found = found._replace(
-        residual=_blanked(solved.residual, is_bad),
-        sigma_min=_blanked(solved.sigma_min, is_bad),
-        det_sign=_blanked(solved.det_sign, is_bad),
+    is_wrong = solved.status != Status.OK
+    if not is_wrong.any():  # pose and candidate are the same arrays
+        solved = jax.device_put(solved)
+        return ForwardKinematics(*solved, solved.pose)
+    is_bad = solved.status == Status.BAD_INPUT
+    pose = _blanked(solved.pose, is_wrong)
+    residual, sigma_min, det_sign, candidate = _blanked(
+        (solved.residual, solved.sigma_min, solved.det_sign, solved.pose), is_bad
     )
+    found = ForwardKinematics(pose, solved.status, residual, solved.steps, sigma_min, det_sign, candidate)
     if np.any(solved.status == Status.STALLED):
-        each = (
-            guess
-            if guesses or guess is None
-            else jax.tree.map(lambda leaf: _repeated(leaf, len(joints)), guess)
-        )
-        found = _again(mech, home, joints, each, found)
+        if not guesses:
+            guess = jax.tree.map(lambda leaf: _repeated(leaf, len(joints)), guess)
+        found = _again(mech, home, joints, guess, found)
     return jax.device_put(found)  # arrays that are aligned are taken over without a copy
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -70,15 +71,24 @@ _at_home = jax.jit(at_home)
 
 
 def solve(
-    mech: Mechanism, joints: np.ndarray, guess: Any, *, one_guess: bool, options: Options = FULL
+    mech: Mechanism,
+    joints: np.ndarray,
+    guess: Any,
+    *,
+    one_guess: bool,
+    options: Options = FULL,
+    workers: int | None = None,
 ) -> Rows:
-    """The first attempt at every row. joints (batch, m); guess: None, one pose, or one a row."""
+    """The first attempt at every row. joints (batch, m); guess: None, one pose, or one a row.
+
+    workers: threads; default: one a core
+    """
     ready = prepared(mech)
     count, dtype = joints.shape[0], joints.dtype
     start = "home" if guess is None else "one" if one_guess else "rows"
     block = BLOCK if jax.default_backend() == "cpu" else ON_ACCELERATOR
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in ready.leaves)
-    program = _program(ready.tree, shapes, ready.order, start, block, joints.shape[1], dtype, options)
+    run_block = program(ready.tree, shapes, ready.order, start, block, joints.shape[1], dtype, options)
     pose_leaves, pose_tree = jax.tree.flatten(ready.shapes[0])
     poses = [_aligned((count, *leaf.shape), dtype) for leaf in pose_leaves]
     numbers = [
@@ -97,7 +107,7 @@ def solve(
         given = [_padded(joints[rows], block), np.int32(size)]
         if guess is not None:
             given.append(guess[0] if one_guess else _padded(guess[rows], block))
-        out = np.asarray(program([*ready.leaves, *map(jnp.asarray, given)])[0])  # (chunks, values, lanes)
+        out = np.asarray(run_block([*ready.leaves, *map(jnp.asarray, given)])[0])  # (chunks, values, lanes)
         out = out[: -(-size // out.shape[2])]
         for pose, begin, end in zip(poses, (0, *cuts), cuts, strict=False):
             part = out[:, begin:end].transpose(0, 2, 1)
@@ -106,12 +116,13 @@ def solve(
             number[rows] = out[:, column].reshape(-1)[:size]
 
     starts = range(0, count, block)
-    list(_threads().map(run, starts) if len(starts) > 1 else map(run, starts))
+    is_parallel = len(starts) > 1 and workers != 1
+    list(_threads().map(run, starts) if is_parallel else map(run, starts))
     return Rows(jax.tree.unflatten(pose_tree, poses), *numbers)
 
 
 @lru_cache(maxsize=64)
-def _program(
+def program(
     tree: Any,
     shapes: tuple,
     order: Order | None,
@@ -124,7 +135,7 @@ def _program(
     """The compiled block: mechanism, home, joints, number of rows, guess -> (chunks, values, lanes)."""
     mech, home = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
     lanes = options.lanes if jax.default_backend() == "cpu" else block
-    size = sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(home.pose))
+    size = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(home.pose))
     given = [jax.ShapeDtypeStruct((block, joints), dtype), jax.ShapeDtypeStruct((), jnp.int32)]
     if start != "home":
         given.append(jax.ShapeDtypeStruct((size,) if start == "one" else (block, size), dtype))
@@ -170,7 +181,7 @@ def _as_pose(flat: Entries, like: Any) -> Any:
 
 def _aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     """An array that JAX takes over without a copy."""
-    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    size = math.prod(shape) * np.dtype(dtype).itemsize
     memory = np.empty(size + 64, np.uint8)
     begin = -memory.ctypes.data % 64
     return memory[begin : begin + size].view(dtype).reshape(shape)

@@ -84,19 +84,16 @@ def _stopped_by_signals() -> Iterator[None]:
 
 
 def _forward(options: argparse.Namespace) -> int:
-    from pk_jax.files.stream import forward_rows
-
-    return _convert(options, forward_rows)
+    return _convert(options, "forward_rows")
 
 
 def _inverse(options: argparse.Namespace) -> int:
-    from pk_jax.files.stream import inverse_rows
-
-    return _convert(options, inverse_rows)
+    return _convert(options, "inverse_rows")
 
 
-def _convert(options: argparse.Namespace, convert) -> int:
+def _convert(options: argparse.Namespace, function: str) -> int:
     progress = _begin()
+    from pk_jax.files import stream
     from pk_jax.files.named import named_mechanism
 
     if options.chunk < 1:
@@ -105,7 +102,7 @@ def _convert(options: argparse.Namespace, convert) -> int:
     named = named_mechanism(options.mechanism, options.unit)
     to_terminal = options.out in (None, "-") and sys.stdout.isatty()  # rows and progress would mix
     try:
-        found = convert(
+        found = getattr(stream, function)(
             named,
             options.rows,
             options.out,

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from pk_jax.cli import main
+from pk_jax.mechanisms.catalogue import CATALOGUE
 
 
 @pytest.fixture(autouse=True)
@@ -67,7 +68,8 @@ def test_optimize_that_ran_out_of_steps(capsys):
 
 def test_list(capsys):
     code, out, _ = run(capsys, "list")
-    assert code == 0 and all(line.count("2006") == 1 for line in out.splitlines())
+    assert code == 0 and [line.split()[0] for line in out.splitlines()] == list(CATALOGUE)
+    assert all(entry.source in line for entry, line in zip(CATALOGUE.values(), out.splitlines(), strict=True))
 
 
 BAD = {

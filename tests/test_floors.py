@@ -22,6 +22,7 @@ RANK["__main__"] = RANK["cli"]
 EVERYWHERE = None
 WHERE = {  # who may import what from outside
     "jax": EVERYWHERE,
+    "jaxlib": {"kinematics"},
     "numpy": EVERYWHERE,
     "optax": {"design"},
     "matplotlib": {"viz"},

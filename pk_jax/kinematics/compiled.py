@@ -8,10 +8,18 @@ through what `jax.extend` gives. Where that fails, the program is compiled the o
 
 from __future__ import annotations
 
+import contextlib
+import os
+import platform
+import tempfile
 from collections.abc import Callable, Sequence
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jaxlib
 from jax.extend import backend
 
 
@@ -57,9 +65,59 @@ def with_extra_options(lowered: Any, options: Options) -> Callable | None:
         build = type(build).ParseFromString(build.SerializeAsString() + extra)
         build.env_option_overrides = [("xla_cpu_prefer_vector_width", options.width)]
         devices = DeviceList((jax.devices()[0],))
-        return client.compile_and_load(str(lowered.compiler_ir("stablehlo")), devices, build).execute
+        source = str(lowered.compiler_ir("stablehlo"))
+        kept = _kept_file(source, repr(options))
+        if (machine_code := _read(kept)) is not None:
+            return client.deserialize_executable(machine_code, devices, build).execute
+        program = client.compile_and_load(source, devices, build)
+        _write(kept, program.serialize())
+        return program.execute
     except (ImportError, AttributeError, TypeError, jax.errors.JaxRuntimeError):
         return None
+
+
+# --- programs kept from run to run, where the user has asked JAX for it (jax_compilation_cache_dir)
+
+
+def _kept_file(*parts: str) -> Path | None:
+    """Where the machine code of this program is kept: by source, options, jaxlib and processor."""
+    folder = jax.config.jax_compilation_cache_dir
+    if not folder:
+        return None
+    name = "\n".join((*parts, jaxlib.__version__, _processor()))
+    return Path(folder) / f"pk_jax-{sha256(name.encode()).hexdigest()}"
+
+
+def _read(file: Path | None) -> bytes | None:
+    """The content of a whole file; None where there is none or it is damaged."""
+    try:
+        content = b"" if file is None else file.read_bytes()
+    except OSError:
+        return None
+    digest, content = content[:32], content[32:]
+    return content if content and sha256(content).digest() == digest else None
+
+
+def _write(file: Path | None, content: bytes) -> None:
+    if file is None:
+        return
+    with contextlib.suppress(OSError):  # a cache that cannot be written is none
+        handle, temporary = tempfile.mkstemp(dir=file.parent)
+        with os.fdopen(handle, "wb") as out:
+            out.write(sha256(content).digest() + content)
+        os.replace(temporary, file)
+
+
+@cache
+def _processor() -> str:
+    """What machine code depends on."""
+    with contextlib.suppress(OSError), open("/proc/cpuinfo") as file:
+        lines = [line for line in file if line.startswith(("model name", "flags", "Features"))]
+        return "".join(sorted(set(lines)))
+    return platform.platform() + platform.processor()
+
+
+# --- options
 
 
 def _serialized(extra: tuple[tuple[str, str], ...]) -> bytes:

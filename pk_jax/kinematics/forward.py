@@ -201,7 +201,7 @@ def _answer(
         where(status == Status.OK, point, jnp.nan),
         status.astype(jnp.int32),
         masked(residual),
-        steps.astype(jnp.int32),
+        jnp.where(is_given, steps, 0).astype(jnp.int32),
         masked(sigma_min),
         masked(det_sign),
         masked(point),

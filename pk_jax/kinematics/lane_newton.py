@@ -90,7 +90,8 @@ def attempt(
         side = judged.sign * start_sign(mech, joints, start, by, None)
     status = verdict(judged, ended.is_stationary, side, is_square=is_square)
     status = jnp.where(is_given, status, Status.BAD_INPUT)
-    return Attempt(ended.pose, status, judged.residual, ended.steps, judged.sigma_min, det_sign)
+    steps = jnp.where(is_given, ended.steps, 0)
+    return Attempt(ended.pose, status, judged.residual, steps, judged.sigma_min, det_sign)
 
 
 def eliminated_by(order: Order | None, home: Home) -> Order | Reference | None:

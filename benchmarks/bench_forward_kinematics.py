@@ -76,14 +76,16 @@ def throughput(
     print(f"solves a second{'':20}{head}   compile   length error  wrong rows")
     found = {}
     one_core = {min(os.sched_getaffinity(0))} if hasattr(os, "sched_getaffinity") else None
-    for name, options, is_alone in (
+    variants = [
         ("pk_jax", compiled.FULL, False),
         ("pk_jax, vector width only", compiled.WIDE, False),
         ("pk_jax, default flags, one core", compiled.PLAIN, True),
-    ):
-        solve = lambda q, options=options, n=1 if is_alone else None: pk_solve(robot, q, options, n)
+    ]
+    for name, options, is_alone in variants:
+        workers = 1 if is_alone else None
+        prepare = lambda q, given=(options, workers): lambda: pk_solve(robot, q, *given)
         with affinity(one_core if is_alone else None):
-            found[name] = line(name, robot, poses, lengths, batches, lambda q, solve=solve: lambda: solve(q))
+            found[name] = line(name, robot, poses, lengths, batches, prepare)
     start = robot.home()[0]
     base, joints, *home = map(np.array, (robot.base, robot.platform, start.translation, start.rotation))
     for peer in _peers.PEERS:
@@ -204,10 +206,8 @@ def latency(robot: pk.Stewart, lengths: np.ndarray) -> None:
         solve()
         times.append(time.perf_counter() - begin)
     low, middle, high = np.quantile(times, [0.05, 0.5, 0.95]) * 1e6
-    print(
-        f"latency of one solve, NumPy in and out: {low:.0f} us (5 %), {middle:.0f} us (median), {high:.0f} us (95 %);"
-    )
-    print(f"  first call {compile_time:.1f} s")
+    print(f"latency of one solve, NumPy in and out: {low:.0f} us (5 %), {middle:.0f} us (median), ", end="")
+    print(f"{high:.0f} us (95 %); first call {compile_time:.1f} s")
 
 
 # --- other mechanisms, an outsider's among them

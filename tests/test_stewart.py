@@ -12,7 +12,6 @@ from pk_jax.mechanisms import stewart
 from pk_jax.mechanisms.catalogue import CATALOGUE
 
 SEMI = pk.catalogued("semi-regular-stewart")
-RANDOM = np.random.default_rng(1)
 NAN = np.nan
 
 
@@ -113,9 +112,8 @@ def test_integers_and_float32():
 # ---------------------------------------------------------------- rotations
 
 ANGLES = [0, 1e-300, 1e-160, 1e-12, 1e-8, 1e-4, 1, 3, *(np.pi - np.array([1e-4, 1e-8, 1e-12, 0]))]
-AXES = np.concatenate(
-    [np.eye(3), -np.eye(3), Rotation.random(6, rng=np.random.default_rng(5)).as_matrix()[0]]
-)
+TILTED = Rotation.random(rng=np.random.default_rng(5)).as_matrix()
+AXES = np.concatenate([np.eye(3), -np.eye(3), TILTED])
 VECTORS = np.concatenate([angle * AXES for angle in ANGLES])
 
 
@@ -133,9 +131,8 @@ def test_rotation_vectors_against_scipy_at_every_angle():
 
 def test_quaternions_against_scipy_at_every_angle():
     of_scipy = Rotation.from_rotvec(VECTORS).as_quat()[:, [3, 0, 1, 2]]
-    pose = pk.SE3.from_quaternion(
-        np.zeros_like(VECTORS), of_scipy * RANDOM.uniform(0.1, 9, (len(VECTORS), 1))
-    )
+    of_any_length = of_scipy * np.random.default_rng(1).uniform(0.1, 9, (len(VECTORS), 1))
+    pose = pk.SE3.from_quaternion(np.zeros_like(VECTORS), of_any_length)
     np.testing.assert_allclose(pose.rotation, Rotation.from_rotvec(VECTORS).as_matrix(), rtol=0, atol=1e-15)
     found = np.asarray(pose.quaternion())
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=0, atol=1e-15)
@@ -157,28 +154,30 @@ GENERATORS = np.stack([rotations.skew(e) for e in jnp.eye(3)], axis=-1)  # (3, 3
 def test_derivatives_at_the_identity_are_those_of_the_exponential(function):
     """To second order: exp([w]) = 1 + [w] + [w][w] / 2 + ..."""
     zero = jnp.zeros(3)
-    np.testing.assert_allclose(jax.jacfwd(function)(zero), GENERATORS, rtol=0, atol=1e-16)
-    np.testing.assert_allclose(jax.jacrev(function)(zero), GENERATORS, rtol=0, atol=1e-16)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(function))(zero), GENERATORS, rtol=0, atol=1e-16)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(function))(zero), GENERATORS, rtol=0, atol=1e-16)
     product = np.einsum("ija,jkb->ikab", GENERATORS, GENERATORS)
     second = (product + np.swapaxes(product, 2, 3)) / 2
-    np.testing.assert_allclose(jax.jacfwd(jax.jacrev(function))(zero), second, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.jacrev(function)))(zero), second, rtol=0, atol=1e-15)
 
 
 def test_third_derivative_of_the_exponential_at_the_identity():
     """exp([w]) = ... - |w|^2 [w] / 6: along w, the third derivative is -[w] for a unit w."""
     along = lambda t: rotations.from_rotation_vector(t * jnp.array([0.0, 0.0, 1.0]))
-    third = jax.jacfwd(jax.jacfwd(jax.jacfwd(along)))(0.0)
+    third = jax.jit(jax.jacfwd(jax.jacfwd(jax.jacfwd(along))))(0.0)
     np.testing.assert_allclose(third, -GENERATORS[..., 2], rtol=0, atol=1e-14)
 
 
 def test_derivatives_back_from_the_identity_are_finite():
     for back in (rotations.to_rotation_vector, rotations.to_quaternion):
-        for angle in (0.0, np.pi):
-            matrix = rotations.about(2, jnp.asarray(angle))
-            assert np.all(np.isfinite(jax.jacrev(back)(matrix)))
+        rate = jax.jit(jax.jacrev(back))
+        for matrix in (np.eye(3), np.diag([-1.0, -1.0, 1.0])):
+            assert np.all(np.isfinite(rate(matrix)))
     there_and_back = lambda w: rotations.to_rotation_vector(rotations.from_rotation_vector(w))
-    np.testing.assert_allclose(jax.jacfwd(there_and_back)(jnp.zeros(3)), np.eye(3), rtol=0, atol=1e-15)
-    assert np.all(np.isfinite(jax.jacfwd(jax.jacrev(there_and_back))(jnp.zeros(3))))
+    np.testing.assert_allclose(
+        jax.jit(jax.jacfwd(there_and_back))(jnp.zeros(3)), np.eye(3), rtol=0, atol=1e-15
+    )
+    assert np.all(np.isfinite(jax.jit(jax.jacfwd(jax.jacrev(there_and_back)))(jnp.zeros(3))))
 
 
 def test_cayley_is_a_rotation_for_every_vector():
@@ -196,7 +195,7 @@ def test_cayley_is_a_rotation_for_every_vector():
 def test_about_turns_by_the_angle():
     for axis in range(3):
         expected = Rotation.from_rotvec(0.7 * np.eye(3)[axis]).as_matrix()
-        np.testing.assert_allclose(rotations.about(axis, jnp.asarray(0.7)), expected, rtol=0, atol=1e-16)
+        np.testing.assert_allclose(rotations.about(axis, jnp.asarray(0.7)), expected, rtol=0, atol=2e-16)
 
 
 # ---------------------------------------------------------------- moving
@@ -218,7 +217,7 @@ def test_a_twist_is_a_velocity_in_base_axes():
     pose, points = some_poses(1)[0], np.array([[0.1, 0.2, 0.3], [-1.0, 0.5, 0.0]])
     arms = np.asarray(poses.place(pose, points)) - pose.translation
     np.testing.assert_allclose(arms, points @ np.asarray(pose.rotation).T, rtol=0, atol=1e-15)
-    found = poses.place_jacobian(pose, jnp.asarray(points))
+    found = jax.jit(poses.place_jacobian)(pose, points)
     for k in range(2):
         np.testing.assert_array_equal(found[k, :, :3], np.eye(3))
         for axis in range(3):
@@ -265,18 +264,15 @@ def least_sigma(mech, pose):
 
 
 def with_sensors():
-    rng = np.random.default_rng(8)
-    more = np.concatenate([rng.uniform(-1, 1, (3, 2)), np.zeros((3, 1))], axis=1)
-    return pk.Stewart(
-        base=np.concatenate([SEMI.base, 1.3 * more]),
-        platform=np.concatenate([SEMI.platform, 0.3 * more[::-1]]),
-    )
+    more = np.pad(np.random.default_rng(8).uniform(-1, 1, (3, 2)), ((0, 0), (0, 1)))
+    ends = (SEMI.base, 1.3 * more), (SEMI.platform, 0.3 * more[::-1])
+    return pk.Stewart(base=np.concatenate(ends[0]), platform=np.concatenate(ends[1]))
 
 
 def test_inverse_is_the_distance_of_the_ends():
     batch = some_poses(20)
     for mech in (SEMI, with_sensors()):
-        found = jax.vmap(mech.inverse)(batch)
+        found = jax.jit(jax.vmap(mech.inverse))(batch)
         np.testing.assert_allclose(found, lengths(mech, batch), rtol=1e-15)
         assert found.shape == (20, len(mech.base))
 
@@ -330,7 +326,7 @@ find_homes = jax.jit(jax.vmap(stewart._best_home))
 @pytest.mark.parametrize("depth", [0.0, 0.3, 1.0])
 def test_home_of_a_random_geometry_is_regular(depth):
     joints = np.random.default_rng(9).uniform(-1, 1, (2, 200, 6, 3)) * [1, 1, depth]
-    mechs = jax.vmap(lambda base, platform: some_stewart(base, platform))(*joints)
+    mechs = some_stewart(*joints)
     home, clearance = find_homes(mechs)
     least = [
         least_sigma(some_stewart(*joints[:, k]), jax.tree.map(lambda leaf, k=k: np.asarray(leaf[k]), home))
@@ -343,12 +339,10 @@ def test_home_of_a_random_geometry_is_regular(depth):
 
 def some_stewart(base, platform):
     """Without the checks at the door."""
-    return jax.tree.map(
-        lambda leaf, new: new, SEMI, jax.tree.unflatten(jax.tree.structure(SEMI), (base, platform))
-    )
+    return jax.tree.unflatten(jax.tree.structure(SEMI), (base, platform))
 
 
-PLATFORMS = [name for name in CATALOGUE if isinstance(pk.catalogued(name), pk.Stewart)]
+PLATFORMS = [name for name in CATALOGUE if not name.startswith("nam-")]
 
 
 @pytest.mark.parametrize("name", PLATFORMS)
@@ -390,13 +384,9 @@ def angles_of_cones(mech, pose, axes):
 def test_margins_of_strokes():
     pose = pk.SE3.from_rotation_vector([0.05, -0.1, 1.1], [0.1, 0.2, 0.1])
     joints = lengths(SEMI, pose)
-    mech = (
-        pk.Stewart(base=SEMI.base, platform=SEMI.platform, stroke=[joints[0], joints[1]])
-        if (joints[0] < joints[1])
-        else pk.Stewart(base=SEMI.base, platform=SEMI.platform, stroke=[joints[1], joints[0]])
-    )
-    margins = mech.margins(pose, joints)
     ends = np.sort(joints[:2])
+    mech = pk.Stewart(base=SEMI.base, platform=SEMI.platform, stroke=ends)
+    margins = mech.margins(pose, joints)
     np.testing.assert_allclose(margins["stroke_min"], (joints - ends[0]) / 0.45368859, rtol=1e-14, atol=1e-16)
     np.testing.assert_allclose(margins["stroke_max"], (ends[1] - joints) / 0.45368859, rtol=1e-14, atol=1e-16)
     assert set(margins) == {"stroke_min", "stroke_max"} and SEMI.margins(pose, joints) == {}
@@ -449,12 +439,12 @@ REFUSED = {
     "planar points": (dict(base=BASE[:, :2]), "Stewart.base must have shape (any, 3), got (6, 2)"),
     "five platform rows": (
         dict(platform=PLATFORM[:5]),
-        "Stewart.platform must have shape (6, 3), got (5, 3)",
+        "must have shape (6, 3), got (5, 3)",
     ),
     "NaN": (dict(base=BASE * NAN), "Stewart.base must be finite"),
     "infinite platform": (
         dict(platform=replaced(PLATFORM, 0, [np.inf, 0, 0])),
-        "Stewart.platform must be fi",
+        "platform must be finite",
     ),
     "strings": (dict(base=[["a"] * 3] * 6), "Stewart.base must be real numbers"),
     "one leg twice": (
@@ -480,9 +470,9 @@ REFUSED = {
     "cones of five legs": (dict(base_cone=np.ones(5)), "Stewart.base_cone must have shape () or (6,)"),
     "axes not unit": (
         dict(base_cone=1.0, cone_axes=1.01 * AXES_UP),
-        "Stewart.cone_axes must be unit vectors",
+        "cone_axes must be unit vectors",
     ),
-    "axes of the base only": (dict(base_cone=1.0, cone_axes=AXES_UP[0]), "Stewart.cone_axes must have shape"),
+    "axes of the base only": (dict(base_cone=1.0, cone_axes=AXES_UP[0]), "cone_axes must have shape"),
 }
 
 

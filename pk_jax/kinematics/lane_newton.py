@@ -20,7 +20,7 @@ from pk_jax.kinematics import elimination
 from pk_jax.kinematics.closure import closed_to, closure, pose_scale
 from pk_jax.kinematics.elimination import Matrix, Order, Reference
 from pk_jax.kinematics.jacobian import SINGULAR_BELOW, units
-from pk_jax.kinematics.lanes import Entries, Lane, entrywise, is_entries, over, times, total
+from pk_jax.kinematics.lanes import Entries, Invariants, Lane, entrywise, is_entries, over, times, total
 from pk_jax.mechanisms.base import Mechanism
 from pk_jax.status import Status
 
@@ -180,6 +180,9 @@ def iterate(
         value = entrywise(lambda m, x, q: m.residual(x, q), mech, pose, joints).items
         step = [total([times(a, f) for a, f in zip(row, value, strict=True)]) for row in first]
         pose, _ = moved(pose, step)
+    linearize = lambda m, x, q: m.linearize(x, q)
+    invariants = Invariants(mech, joints)
+    entrywise(linearize, mech, start, joints, invariants=invariants)
     taken = int(first is not None)
     items, shape = _items(pose, like)
 
@@ -189,7 +192,7 @@ def iterate(
     def advance(state):
         k, items, steps, has_stopped, is_stationary = state
         pose = _pose(items, shape)
-        value, jacobian = entrywise(lambda m, x, q: m.linearize(x, q), mech, pose, joints)
+        value, jacobian = entrywise(linearize, mech, pose, joints, invariants=invariants)
         pose, longest = moved(pose, _least_squares(jacobian.rows(), value.items, by))
         items = [jnp.where(has_stopped, *each) for each in zip(items, _items(pose, like)[0], strict=True)]
         steps = jnp.where(has_stopped, steps, steps + 1)

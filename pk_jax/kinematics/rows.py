@@ -23,8 +23,9 @@ from pk_jax.kinematics.lane_newton import Attempt, Home, at_home, attempt, home_
 from pk_jax.kinematics.lanes import Entries, split, split_rows
 from pk_jax.mechanisms.base import Mechanism
 
-BLOCK = 4096  # rows of one call; on an accelerator they are the lanes, all at once
+BLOCK = 8192  # rows of one call at most; on an accelerator they are the lanes, all at once
 ON_ACCELERATOR = 1 << 16
+WORTH_A_THREAD = 4096  # rows
 
 
 class Prepared(NamedTuple):
@@ -102,12 +103,12 @@ def solve(
         guess = np.concatenate(flat, axis=1)
 
     def run(first: int) -> None:
-        rows = slice(first, min(first + block, count))
+        rows = slice(first, min(first + share, count))
         size = rows.stop - first
-        given = [_padded(joints[rows], block), np.int32(size)]
+        given = [jnp.asarray(_padded(joints[rows], block)), _count(size)]
         if guess is not None:
-            given.append(guess[0] if one_guess else _padded(guess[rows], block))
-        out = np.asarray(run_block([*ready.leaves, *map(jnp.asarray, given)])[0])  # (chunks, values, lanes)
+            given.append(jnp.asarray(guess[0] if one_guess else _padded(guess[rows], block)))
+        out = np.asarray(run_block([*ready.leaves, *given])[0])  # (chunks, values, lanes)
         out = out[: -(-size // out.shape[2])]
         for pose, begin, end in zip(poses, (0, *cuts), cuts, strict=False):
             part = out[:, begin:end].transpose(0, 2, 1)
@@ -115,9 +116,11 @@ def solve(
         for column, number in enumerate(numbers, cuts[-1]):
             number[rows] = out[:, column].reshape(-1)[:size]
 
-    starts = range(0, count, block)
-    is_parallel = len(starts) > 1 and workers != 1
-    list(_threads().map(run, starts) if is_parallel else map(run, starts))
+    workers = cores() if workers is None else workers
+    blocks = max(-(-count // block), min(workers, -(-count // WORTH_A_THREAD)), 1)
+    share = max(-(-count // blocks), 1)
+    starts = range(0, count, share)
+    list(_threads().map(run, starts) if workers > 1 and len(starts) > 1 else map(run, starts))
     return Rows(jax.tree.unflatten(pose_tree, poses), *numbers)
 
 
@@ -196,6 +199,18 @@ def _padded(rows: np.ndarray, count: int) -> np.ndarray:
 
 
 @cache
+def cores() -> int:
+    """How many blocks are solved at a time."""
+    if jax.default_backend() != "cpu":
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@cache
 def _threads() -> ThreadPoolExecutor:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return ThreadPoolExecutor(cores if jax.default_backend() == "cpu" else 1, thread_name_prefix="pk_jax")
+    return ThreadPoolExecutor(cores(), thread_name_prefix="pk_jax")
+
+
+@lru_cache(maxsize=1024)
+def _count(size: int) -> jax.Array:
+    return jnp.asarray(np.int32(size))

@@ -7,11 +7,14 @@ Shapes are always checked. Values are checked only where they are known, that is
 from __future__ import annotations
 
 import contextlib
+import warnings
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+UNITS_DIFFER_BY = 100
 
 
 def is_concrete(*trees: Any) -> bool:
@@ -70,6 +73,12 @@ def is_finite(name: str, value: jax.Array) -> None:
 def is_positive(name: str, value: jax.Array) -> None:
     if not np.all(np.asarray(value) > 0):
         raise ValueError(f"{name} must be positive, got {_short(value)}")
+
+
+def warn_of_units(what: str, ratio: float, *, stacklevel: int) -> None:
+    """Warn where two lengths that belong together differ so much that one is in another unit."""
+    if not 1 / UNITS_DIFFER_BY <= ratio <= UNITS_DIFFER_BY:  # NaN, too
+        warnings.warn(f"{what} differ {ratio:.3g} times: are they in one unit?", stacklevel=stacklevel + 1)
 
 
 def is_count(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:

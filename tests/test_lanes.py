@@ -113,13 +113,7 @@ KNOWN = STRUCTURE | PRODUCTS | ELEMENTS
 MAY_FALL_BACK = {"add in place", "take, filled with zeros", "tile", "select"}
 
 
-CASES = (
-    (jnp.float64, ()),
-    (jnp.float64, (3,)),
-    (jnp.float64, (2, 2)),
-    (jnp.float32, ()),
-    (jnp.float32, (3,)),
-)
+CASES = ((jnp.float64, ()), (jnp.float64, (2, 2)), (jnp.float32, (3,)))
 
 
 def on_lanes(x, dtype, lanes):
@@ -144,9 +138,8 @@ def test_entry_by_entry_is_the_plain_function(name):
     """Also in float32, and the precision is kept."""
     function = (KNOWN | FALLING_BACK)[name]
     arrays = [on_lanes(X, *case) for case in CASES]
-    evaluate = jax.jit(
-        lambda *arrays: [both(function, a, lanes) for a, (_, lanes) in zip(arrays, CASES, strict=True)]
-    )
+    evaluate = lambda *arrays: [both(function, a, lanes) for a, (_, lanes) in zip(arrays, CASES, strict=True)]
+    evaluate = jax.jit(evaluate, compiler_options={"xla_backend_optimization_level": 0})  # compiles faster
     for (found, plain), (dtype, _) in zip(evaluate(*arrays), CASES, strict=True):
         assert found.dtype == plain.dtype or plain.dtype != dtype  # float64 constants may widen float32
         tolerance = 1e-14 if dtype == jnp.float64 else 4e-6

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -33,7 +32,6 @@ from pk_jax.status import Status
 
 AGAIN = 64  # lost rows of a traced batch that are solved again at a time
 WORTH_LANES = 4096  # rows of a traced batch
-UNITS_DIFFER_BY = 100  # joints that many times the length of the home's are most likely in another unit
 
 
 class ForwardKinematics(NamedTuple):
@@ -295,9 +293,5 @@ def _warn_of_units(mech: Mechanism, joints: np.ndarray, home: np.ndarray) -> Non
     given, own = np.abs(joints[:, is_length]), np.abs(home[is_length])
     given = given[np.isfinite(given) & (given > 0)]
     if given.size and own.any():
-        ratio = np.median(given) / np.median(own)
-        if not 1 / UNITS_DIFFER_BY < ratio < UNITS_DIFFER_BY:
-            warnings.warn(
-                f"joints are {ratio:.3g} times those of {type(mech).__name__}'s home: are they in its unit?",
-                stacklevel=5,
-            )
+        what = f"joints and those of {type(mech).__name__}'s home"
+        checks.warn_of_units(what, np.median(given) / np.median(own), stacklevel=5)

@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 
 from pk_jax import checks
-from pk_jax.geometry.poses import is_pose
+from pk_jax.geometry.poses import is_pose, pose_units, position
 from pk_jax.kinematics import newton
 from pk_jax.kinematics.batching import all_finite, home_shapes, over_rows, rows_of, where
 from pk_jax.kinematics.closure import is_closed, joint_scale
@@ -48,10 +48,23 @@ def inverse_kinematics(
     require_mechanism("inverse_kinematics", mech)
     home_pose, home_joints = home_shapes(mech)
     pose, many = rows_of("pose", pose, home_pose)
+    if checks.is_concrete((mech, pose)):
+        _warn_of_units(mech, pose)
     if branch is None:
         return _solve(mech, (pose,), free, (many,))
     branch, branches = branch_rows(branch, home_joints)
     return _solve(mech, (pose, branch), free, (many, branches))
+
+
+def _warn_of_units(mech: Mechanism, pose: Any) -> None:
+    """Positions a hundred times as far as the mechanism is large are most likely in another unit."""
+    is_length = np.asarray(pose_units(pose, mech.pose_units), bool)
+    at = np.asarray(position(pose))
+    far = np.linalg.norm(at[..., is_length[: at.shape[-1]]], axis=-1)
+    far = far[np.isfinite(far)]
+    if far.size:
+        what = f"positions and {type(mech).__name__}.length()"
+        checks.warn_of_units(what, max(float(np.median(far)) / float(mech.length()), 1.0), stacklevel=3)
 
 
 def branch_rows(branch: Any, home_joints: jax.Array) -> tuple[jax.Array, bool]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +15,6 @@ from pk_jax.mechanisms.base import LegMechanism, Skeleton
 
 LEGS = 6
 SINGULAR_BELOW = 1e-6  # least singular value, without units, below which a platform is of no use
-UNITS_DIFFER_BY = 100  # a base that many times the platform is most likely a mistake of units
 
 
 class Stewart(LegMechanism):
@@ -92,12 +89,7 @@ class Stewart(LegMechanism):
                         f"Stewart.base and platform must not give the same leg twice, got legs {j} and {i} "
                         f"from {ends[i, :3].tolist()} to {ends[i, 3:].tolist()}"
                     )
-        if not 1 / UNITS_DIFFER_BY <= sizes[0] / sizes[1] <= UNITS_DIFFER_BY:
-            warnings.warn(
-                f"Stewart: base of radius {sizes[0]:.3g} and platform of radius {sizes[1]:.3g}: "
-                "are they in one unit?",
-                stacklevel=5,
-            )
+        checks.warn_of_units("Stewart: the sizes of base and platform", sizes[0] / sizes[1], stacklevel=4)
         if self.stroke is not None:
             least, greatest = np.moveaxis(np.asarray(self.stroke), -1, 0)
             if not np.all((least > 0) & (least < greatest)):

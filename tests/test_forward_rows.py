@@ -191,9 +191,8 @@ def test_a_guess_printed_with_six_digits_gives_the_pose_itself():
 
 
 def test_a_traced_guess_that_is_no_rotation_is_never_ok():
-    solve = jax.jit(
-        lambda r: pk.forward_kinematics(SEMI, JOINTS[0], pk.SE3(jnp.array([0, 0, 1.0]), r)).status
-    )
+    at = np.array([0.0, 0.0, 1.0])
+    solve = jax.jit(lambda r: pk.forward_kinematics(SEMI, JOINTS[0], pk.SE3(at, r)).status)
     assert int(solve(np.eye(3))) == Status.OK
     for rotation in (1.2 * np.eye(3), np.diag([1.0, 1.0, -1.0]), np.zeros((3, 3))):
         assert int(solve(rotation)) != Status.OK
@@ -202,7 +201,7 @@ def test_a_traced_guess_that_is_no_rotation_is_never_ok():
 @pytest.mark.parametrize(
     "guess",
     [np.zeros(6), "home", [1.0], POSES[:3], POSES[:0]],
-    ids=["array", "string", "list", "three", "none"],
+    ids=["an array", "a string", "a list", "three rows", "no row"],
 )
 def test_a_wrong_guess_is_told(guess):
     said = r"^(guess must be a pk_jax.SE3|batched arguments must)"

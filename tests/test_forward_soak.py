@@ -12,7 +12,7 @@ from pk_jax.mechanisms.catalogue import CATALOGUE
 
 ROWS = int(os.environ.get("PK_SOAK_ROWS", 1_000_000))
 BLOCK = 100_000
-SURE = {"semi-regular-stewart"}  # platforms of which every pose in RANGES comes back as itself
+SURE = {"semi-regular-stewart"}  # every pose in RANGES comes back as itself, unless beyond a singularity
 
 
 @pytest.mark.soak
@@ -22,7 +22,7 @@ def test_a_million_poses_there_and_back(name):
     mech = pk.catalogued(name)
     base = np.asarray(mech.base)
     size = np.sqrt(np.mean(np.sum((base - base.mean(axis=0)) ** 2, axis=1)))
-    others = lost = 0
+    missed = 0
     for seed in range(-(-ROWS // BLOCK)):
         poses = some_poses(mech, min(ROWS, BLOCK), RANGES, seed)
         joints = lengths(mech, poses)
@@ -36,9 +36,11 @@ def test_a_million_poses_there_and_back(name):
         np.testing.assert_array_equal(np.asarray(found.det_sign)[is_ok], 1)
         assert np.all(np.asarray(found.sigma_min)[is_ok] > 0)
         assert np.all(np.isnan(np.asarray(found.pose.rotation)[~is_ok]))
-        gap = np.abs(np.asarray(pose.translation) - np.asarray(poses.translation)[is_ok]).max(axis=1) / size
-        turn = np.abs(np.asarray(pose.rotation) - np.asarray(poses.rotation)[is_ok]).max(axis=(1, 2))
-        others += np.sum(np.maximum(gap, turn) > 1e-6)
-        lost += np.sum(~is_ok)
+        gap = np.abs(np.asarray(found.pose.translation) - poses.translation).max(axis=1) / size
+        turn = np.abs(np.asarray(found.pose.rotation) - poses.rotation).max(axis=(1, 2))
+        is_itself = np.maximum(gap, turn) <= 1e-6  # False for NaN
+        is_home_side = sides(mech, poses) > 0
+        assert not np.any(is_itself & ~is_home_side)
+        missed += np.sum(is_home_side & ~is_itself)
     if name in SURE:
-        assert others == lost == 0
+        assert missed == 0

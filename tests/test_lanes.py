@@ -41,6 +41,7 @@ STRUCTURE = {
     "dynamic update": lambda x: lax.dynamic_update_slice(x, x[:2, :2], (1, 1)),
     "transpose": lambda x: x.T,
     "swap axes": lambda x: jnp.swapaxes(jnp.reshape(x, (3, 2, 2)), 0, 2),
+    "cycled axes": lambda x: jnp.transpose(jnp.reshape(x, (3, 2, 2)), (1, 2, 0)),
     "roll": lambda x: jnp.roll(x, (1, -1), axis=(0, 1)),
     "flip": lambda x: jnp.flip(x, axis=0),
     "pad": lambda x: jnp.pad(x, ((1, 0), (0, 2)), constant_values=3.0),
@@ -52,7 +53,7 @@ STRUCTURE = {
     "triangle": lambda x: jnp.tril(x),
     "meshes": lambda x: jnp.arange(4) * x + jnp.arange(3.0)[:, None] * jnp.eye(3, 4),
     "whole numbers": lambda x: x * ((jnp.arange(4) + 1) // 2) + x * (jnp.arange(4) % 3),
-    "shifted whole numbers": lambda x: x * lax.div(jnp.arange(-2, 2), jnp.asarray(3)),
+    "shifted whole numbers": lambda x: x * lax.div(jnp.arange(-3, 1), jnp.asarray(2)),
     "a sum of nothing": lambda x: x + jnp.sum(x[:0]) + jnp.sum(jnp.zeros(0)),
 }
 PRODUCTS = {

@@ -1,4 +1,4 @@
-"""Following a path: every pose from the one before, and a stop where lengths cannot tell the branches apart."""
+"""Following a path: every pose from the one before, and a stop where lengths cannot tell branches apart."""
 
 import jax
 import jax.numpy as jnp

@@ -28,6 +28,16 @@ def is_pose(pose: Pose) -> jax.Array:
     return (off <= ORTHONORMAL_TO) & (jnp.sum(r[2] * jnp.cross(r[0], r[1])) > 0)
 
 
+def settle(pose: Pose) -> Pose:
+    """The pose with its rotation made orthonormal to roundoff: the nearest one, by two Newton steps."""
+    if not isinstance(pose, SE3):
+        return pose
+    r = pose.rotation
+    for _ in range(2):
+        r = r @ (3 * jnp.eye(3, dtype=r.dtype) - r.T @ r) / 2
+    return jax.tree.unflatten(jax.tree.structure(pose), (pose.translation, r))
+
+
 def retract(pose: Pose, twist: jax.Array) -> Pose:
     """The pose reached from `pose` by the tangent increment `twist` (n,)."""
     if isinstance(pose, SE3):

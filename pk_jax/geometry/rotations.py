@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from pk_jax.geometry import safe
 
@@ -32,6 +33,7 @@ def about(axis: int, angle: jax.Array) -> jax.Array:
 
 def from_quaternion(q: jax.Array) -> jax.Array:
     """Rotation of a quaternion (w, x, y, z) of any length but zero. -> (3, 3)"""
+    q = q / lax.stop_gradient(jnp.max(jnp.abs(q)))  # its square neither overflows nor vanishes
     q = q / jnp.linalg.norm(q)
     k = skew(q[1:])
     return jnp.eye(3, dtype=q.dtype) + 2 * (q[0] * k + k @ k)
@@ -57,21 +59,37 @@ def to_quaternion(r: jax.Array) -> jax.Array:
 
 def from_rotation_vector(v: jax.Array) -> jax.Array:
     """Rotation about v by |v| radians. -> (3, 3)"""
-    angle = safe.norm(v)
+    squared = jnp.sum(v * v)
     k = skew(v)
-    # sin(t)/t and (1 - cos t)/t^2 through sinc, whose derivatives at 0 are right
-    return jnp.eye(3, dtype=v.dtype) + jnp.sinc(angle / jnp.pi) * k + _versine(angle) * (k @ k)
+    return jnp.eye(3, dtype=v.dtype) + _sine_ratio(squared) * k + _sine_ratio(squared / 4) ** 2 / 2 * (k @ k)
 
 
 def to_rotation_vector(r: jax.Array) -> jax.Array:
     """Axis times angle, |.| <= pi. -> (3,)"""
     q = to_quaternion(r)
     q = jnp.where(q[0] < 0, -q, q)
-    sine = safe.norm(q[1:])
-    # angle / sin(angle / 2), 2 at the identity
-    ratio = jnp.where(sine > 0, safe.divide(2 * jnp.arctan2(sine, q[0]), sine), 2 / q[0])
-    return ratio * q[1:]
+    squared = jnp.sum(q[1:] ** 2)
+    is_small = squared < SMALL
+    sine = jnp.sqrt(jnp.where(is_small, 1, squared))
+    return jnp.where(is_small, 2 * _series(_ARCSINE, squared), 2 * jnp.arctan2(sine, q[0]) / sine) * q[1:]
 
 
-def _versine(angle: jax.Array) -> jax.Array:
-    return jnp.sinc(angle / (2 * jnp.pi)) ** 2 / 2
+# functions of the square of an angle, or of its sine, with derivatives of every order at zero
+
+SMALL = 1e-2
+_SINE = (1, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800)
+_ARCSINE = (1, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040, 135135 / 9676800)
+
+
+def _sine_ratio(squared: jax.Array) -> jax.Array:
+    """sin(t) / t of t^2."""
+    is_small = squared < SMALL
+    angle = jnp.sqrt(jnp.where(is_small, 1, squared))
+    return jnp.where(is_small, _series(_SINE, squared), jnp.sin(angle) / angle)
+
+
+def _series(coefficients: tuple[float, ...], x: jax.Array) -> jax.Array:
+    total = jnp.zeros_like(x)
+    for coefficient in reversed(coefficients):
+        total = total * x + coefficient
+    return total

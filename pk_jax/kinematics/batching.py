@@ -39,7 +39,8 @@ def rows_of(name: str, value: Any, one: Any, *, numpy: bool = False) -> tuple[An
         return jax.tree.unflatten(jax.tree.structure(one), [row for row, _ in rows]), rows[0][1]
     if isinstance(value, SE3):
         raise ValueError(f"{name} must be an array of shape {one.shape}, got an SE3")
-    array = (checks.real_numpy if numpy else checks.real_array)(name, value).astype(one.dtype)
+    array = (checks.real_numpy if numpy else checks.real_array)(name, value)
+    array = array if array.dtype == one.dtype else array.astype(one.dtype)
     if array.ndim == one.ndim + 1:
         checks.has_shape(name, array, (None, *one.shape))
     elif array.ndim == one.ndim:

@@ -12,7 +12,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 
 from pk_jax import checks
-from pk_jax.geometry.poses import retract, tangent_size
+from pk_jax.geometry.poses import is_pose, retract, settle, tangent_size
 from pk_jax.kinematics import lane_newton, newton, rows
 from pk_jax.kinematics.batching import (
     all_finite,
@@ -55,7 +55,7 @@ def forward_kinematics(mech: Mechanism, joints: Any, guess: Any = None) -> Forwa
     Status: OK: closed to roundoff; OTHER_MODE: closed, but det A has another sign than at the
     start; SINGULAR: closed on a type II singularity; UNREACHABLE: the mechanism's closed form says
     that no real pose exists; STALLED: the iteration ended off a solution; STEP_LIMIT; BAD_INPUT:
-    NaN, infinity or a distance <= 0 in the joints, or a NaN guess; INCONSISTENT: redundant
+    NaN, infinity or a distance <= 0 in the joints, or a guess that is no pose; INCONSISTENT: redundant
     equations that disagree by more than 1e-6 of their terms (for redundant equations OK means that
     the pose is a least-squares solution, its residual reported). An equal det_sign means "same side of
     the singularity", not "same assembly mode": only a path (`track`) tells the mode.
@@ -164,9 +164,9 @@ def _persist(
     mech: Mechanism, home: Home, joints: jax.Array, guess: Any, found: ForwardKinematics
 ) -> ForwardKinematics:
     """A STALLED row again, by Levenberg-Marquardt; any other as it is."""
-    is_given = is_possible(mech, joints) & (True if guess is None else all_finite(guess))
+    is_given = is_possible(mech, joints) & (True if guess is None else all_finite(guess) & is_pose(guess))
     is_lost = (found.status == Status.STALLED) & is_given
-    start = home.pose if guess is None else where(is_lost, guess, home.pose)
+    start = home.pose if guess is None else settle(where(is_lost, guess, home.pose))
     q = jnp.where(is_lost, joints, home.joints)
     solution = newton.solve(
         lambda x: mech.linearize(x, q), retract, start, scale=pose_scale(mech, start), is_needed=is_lost

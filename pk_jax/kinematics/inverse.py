@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 
 from pk_jax import checks
-from pk_jax.geometry.poses import is_pose, pose_units, position
+from pk_jax.geometry.poses import is_pose, pose_units, position, settle
 from pk_jax.kinematics import newton
 from pk_jax.kinematics.batching import all_finite, home_shapes, over_rows, rows_of, where
 from pk_jax.kinematics.closure import is_closed, joint_scale
@@ -84,7 +84,7 @@ def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = No
     home_pose, home_joints = mech.home()
     is_given = all_finite(pose) & is_pose(pose)
     is_mode = True if branch is None else jnp.all(jnp.abs(branch) == 1)
-    pose = where(is_given, pose, home_pose)  # lost rows work on the home pose and are masked after
+    pose = settle(where(is_given, pose, home_pose))  # lost rows work on the home pose and are masked after
     if hasattr(mech, "inverse"):
         joints_at = lambda pose: mech.inverse(pose, branch, free=free)
         failed = Status.UNREACHABLE

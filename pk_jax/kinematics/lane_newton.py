@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pk_jax.geometry.poses import pose_units, retract
+from pk_jax.geometry.poses import is_pose, pose_units, retract, settle
 from pk_jax.kinematics import elimination
 from pk_jax.kinematics.closure import closed_to, closure, pose_scale
 from pk_jax.kinematics.elimination import Matrix, Order, Reference
@@ -77,8 +77,8 @@ def attempt(
         is_given = reduce(jnp.logical_and, [q > 0 for q in joints.items], is_given)
     if not is_home:
         finite = [jnp.isfinite(x) for leaf in jax.tree.leaves(start, is_leaf=is_entries) for x in leaf.items]
-        is_given = reduce(jnp.logical_and, finite, is_given)
-        start = _where(is_given, start, home.pose)
+        is_given = reduce(jnp.logical_and, [*finite, *entrywise(is_pose, start).items], is_given)
+        start = entrywise(settle, _where(is_given, start, home.pose))
     joints = _where(is_given, joints, home.joints)  # lost rows work at home and are masked after
     by = eliminated_by(order, home)
     ended = iterate(mech, joints, start, by, home.first.rows() if is_home else None, home.first.shape[1])

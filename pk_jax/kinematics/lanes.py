@@ -204,11 +204,12 @@ def _apply(
         return [_dot_general(*inputs, params["dimension_numbers"])]
     if name == "iota":
         return [_iota(params["shape"], params["dimension"])]
-    if name in _ARITHMETIC:
+    is_float = jnp.issubdtype(equation.outvars[0].aval.dtype, jnp.floating)
+    if name in _ARITHMETIC and is_float:
         function = _ARITHMETIC[name]
-    elif name == "integer_pow":
+    elif name == "integer_pow" and is_float:
         function = functools.partial(_integer_power, y=params["y"])
-    elif name in _ELEMENTWISE:
+    elif name in _ELEMENTWISE or name in _ARITHMETIC:  # whole numbers divide and overflow as JAX says
         function = functools.partial(_bind, equation)
     else:
         raise UnknownPrimitive(name)
@@ -278,6 +279,8 @@ _REDUCTIONS: dict[str, Callable] = {
 
 
 def _reduce(function: Callable, entries: Entries, axes: Sequence[int]) -> Entries:
+    if not entries.items:
+        raise UnknownPrimitive("a reduction of nothing")
     kept = [axis for axis in range(len(entries.shape)) if axis not in axes]
     groups = entries.indices().transpose(*kept, *axes).reshape(*(entries.shape[axis] for axis in kept), -1)
     shape = groups.shape[:-1]
@@ -287,6 +290,8 @@ def _reduce(function: Callable, entries: Entries, axes: Sequence[int]) -> Entrie
 
 def _dot_general(left: Entries, right: Entries, dimension_numbers) -> Entries:
     (left_sum, right_sum), (left_batch, right_batch) = dimension_numbers
+    if not (left.items and right.items):
+        raise UnknownPrimitive("a product of nothing")
 
     def arranged(entries: Entries, summed, batch):
         free = [axis for axis in range(len(entries.shape)) if axis not in (*summed, *batch)]
@@ -377,6 +382,8 @@ def _by_jax(primitive) -> Callable:
                 arrays.append(np.asarray(entries.items).reshape(entries.shape).astype(np.int32))
             else:
                 raise UnknownPrimitive(f"{primitive.name} at an index that is computed")
+        if "fill_value" in params:  # whatever it is, -1 marks where it goes
+            params = params | {"fill_value": -1}
         with jax.ensure_compile_time_eval():
             indices = np.asarray(primitive.bind(*map(jnp.asarray, arrays), **params))
         if np.any((indices < 0) | (indices >= len(items))):  # filled in from out of bounds

@@ -26,6 +26,7 @@ from pk_jax.mechanisms.base import Mechanism
 BLOCK = 8192  # rows of one call at most; on an accelerator they are the lanes, all at once
 ON_ACCELERATOR = 1 << 16
 WORTH_A_THREAD = 4096  # rows
+ORDERS = 4  # orders of pivots that a family of mechanisms is compiled for
 
 
 class Prepared(NamedTuple):
@@ -62,6 +63,7 @@ def prepared(mech: Mechanism) -> Prepared:
             home = home_from(pose, joints, jacobian, mech.actuated_rows)
             leaves, tree = jax.tree.flatten((mech, home))
             leaves = [jnp.asarray(leaf) for leaf in leaves]
+            order = _order_in_use(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), order)
         mech_leaves = len(jax.tree.leaves(mech))
         home = jax.tree.unflatten(jax.tree.structure(home), leaves[mech_leaves:])
         found = _prepared[mech] = Prepared(home, order, home_shapes(mech), leaves, tree)
@@ -122,6 +124,21 @@ def solve(
     starts = range(0, count, share)
     list(_threads().map(run, starts) if workers > 1 and len(starts) > 1 else map(run, starts))
     return Rows(jax.tree.unflatten(pose_tree, poses), *numbers)
+
+
+def _order_in_use(tree: Any, shapes: tuple, order: Order | None) -> Order | None:
+    """The order of pivots, for the first few geometries of a family that need another one.
+
+    Every order is another program. From then on one program serves all geometries: without an
+    order, by the inverse at home, half as fast, and nothing more to compile.
+    """
+    seen = _orders_seen.setdefault((tree, shapes), [])
+    if order not in seen and len(seen) < ORDERS:
+        seen.append(order)
+    return order if order in seen else None
+
+
+_orders_seen: dict[tuple, list[Order | None]] = {}
 
 
 @lru_cache(maxsize=64)

@@ -10,9 +10,16 @@ import jax.numpy as jnp
 from jax import lax
 
 from pk_jax import checks
-from pk_jax.geometry.poses import difference
+from pk_jax.geometry.poses import difference, is_pose, settle
 from pk_jax.kinematics import lane_newton, rows
-from pk_jax.kinematics.batching import home_shapes, is_possible, rows_of, where, without_derivatives
+from pk_jax.kinematics.batching import (
+    all_finite,
+    home_shapes,
+    is_possible,
+    rows_of,
+    where,
+    without_derivatives,
+)
 from pk_jax.kinematics.closure import pose_scale
 from pk_jax.kinematics.forward import with_derivatives
 from pk_jax.kinematics.lanes import Entries, entrywise, is_entries, split, stack, times
@@ -44,7 +51,7 @@ def track(mech: Mechanism, joints_path: Any, start: Any = None, *, closest: floa
         Newton would converge, with zero residual, and on the wrong one;
     OTHER_MODE: det A changed its sign, or the pose lies more than twice the first Newton step away,
         farther than where Newton's method is sure to belong to its start (Kantorovich);
-    STALLED, INCONSISTENT, BAD_INPUT: as for `forward_kinematics`.
+    STALLED, INCONSISTENT, BAD_INPUT (also a start that is no pose): as for `forward_kinematics`.
 
     Sample the path finely: the rows are all it is known by. Differentiable in the joints and the
     geometry; vmap it over many paths.
@@ -84,6 +91,8 @@ def _follow(mech: Mechanism, home: Any, path: jax.Array, start: Any, closest: An
     entries, at_home = jax.tree.map(split, (mech, home))
     by = lane_newton.eliminated_by(order, at_home)
     is_square = home.first.shape[0] == home.first.shape[1]
+    is_known = all_finite(start) & is_pose(start)
+    start = settle(where(is_known, start, home.pose))
     from_start = jax.tree.map(split, start)
     side = jnp.ones_like(home.sign)
     if by is not None:
@@ -91,7 +100,7 @@ def _follow(mech: Mechanism, home: Any, path: jax.Array, start: Any, closest: An
 
     def step(before, q):
         pose, sigma, fall, stopped = before
-        is_given = is_possible(mech, q)
+        is_given = is_possible(mech, q) & is_known
         at, q = jax.tree.map(split, pose), split(jnp.where(is_given, q, home.joints))
         ended = lane_newton.iterate(entries, q, at, by, None, home.first.shape[1])
         judged = lane_newton.judge(entries, q, ended.pose, by, mech.actuated_rows)

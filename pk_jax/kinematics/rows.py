@@ -121,8 +121,16 @@ def solve(
     workers = cores() if workers is None else workers
     blocks = max(-(-count // block), min(workers, -(-count // WORTH_A_THREAD)), 1)
     share = max(-(-count // blocks), 1)
-    starts = range(0, count, share)
-    list(_threads().map(run, starts) if workers > 1 and len(starts) > 1 else map(run, starts))
+    starts = iter(range(0, count, share))
+
+    def drain() -> None:
+        for first in starts:  # each block is taken by one thread
+            run(first)
+
+    helpers = [_threads().submit(drain) for _ in range(min(workers, blocks) - 1)]
+    drain()
+    for helper in helpers:
+        helper.result()
     return Rows(jax.tree.unflatten(pose_tree, poses), *numbers)
 
 

@@ -30,8 +30,8 @@ class Stewart(LegMechanism):
     The six legs of a platform whose joints are affine copies of the base's planar ones (two regular
     hexagons, say) are dependent in every pose, "architecturally singular", and refused.
 
-    Source: the patent US 2009/0094967-type platform of papers' embodiments 1 and 2 is this class with
-    nine rows; Stewart 1965; Gough and Whitehall 1962.
+    Source: Stewart 1965, Proc. IMechE 180; with nine rows both embodiments of Ryu et al., patent
+    application KR 10-2000-0073215.
     """
 
     base: jax.Array

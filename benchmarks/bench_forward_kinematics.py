@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import platform
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -35,6 +36,9 @@ MOST_ROWS = {"scipy_root": 100, "numpy_batched": 10_000, "optimistix_newton": 10
 
 def main() -> None:
     pk.enable_x64()
+    if "--latency" in sys.argv[1:]:
+        robot = pk.catalogued(ROBOT)
+        return latency(np.asarray(robot.home()[1]) + 0.01, robot)
     quick = "--quick" in sys.argv[1:]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     print(f"{_processor()}, {cores} cores, jax {jax.__version__}, {jax.devices()[0].device_kind}, float64\n")
@@ -48,7 +52,11 @@ def main() -> None:
         others = {peer: value / other for peer, other in best.items() if peer not in ours}
         print(f"  {name:32}" + "  ".join(f"{ratio:.3g} x {peer}" for peer, ratio in others.items()))
     verdict_cost(robot, lengths[: min(len(lengths), 200_000)])
-    latency(robot, lengths[0])
+    print("\nlatency of one solve, NumPy in and out, quantiles 5, 50 and 95 %:")
+    for dispatch in ("true", "false"):
+        print(f"  JAX_CPU_ENABLE_ASYNC_DISPATCH={dispatch:6}", end="", flush=True)
+        command = [sys.executable, "-m", "benchmarks.bench_forward_kinematics", "--latency"]
+        subprocess.run(command, env=os.environ | {"JAX_CPU_ENABLE_ASYNC_DISPATCH": dispatch}, check=True)
     other_mechanisms()
 
 
@@ -190,8 +198,8 @@ def verdict_cost(robot: pk.Stewart, lengths: np.ndarray) -> None:
     print(f"without: {100 * (whole / alone - 1):.0f} % of the solve")
 
 
-def latency(robot: pk.Stewart, lengths: np.ndarray) -> None:
-    """One row of NumPy in, the pose as NumPy out."""
+def latency(lengths: np.ndarray, robot: pk.Stewart) -> None:
+    """One row of NumPy in, the pose as NumPy out, in a process of its own."""
 
     def solve():
         pose = pk.forward_kinematics(robot, lengths).pose
@@ -206,8 +214,7 @@ def latency(robot: pk.Stewart, lengths: np.ndarray) -> None:
         solve()
         times.append(time.perf_counter() - begin)
     low, middle, high = np.quantile(times, [0.05, 0.5, 0.95]) * 1e6
-    print(f"latency of one solve, NumPy in and out: {low:.0f} us (5 %), {middle:.0f} us (median), ", end="")
-    print(f"{high:.0f} us (95 %); first call {compile_time:.1f} s")
+    print(f"{low:5.0f} {middle:5.0f} {high:5.0f} us; first call {compile_time:.1f} s")
 
 
 # --- other mechanisms, an outsider's among them

@@ -27,8 +27,12 @@ def known_values() -> contextlib.AbstractContextManager:
 
     Outside of one it does nothing: `ensure_compile_time_eval` runs jitted functions op by op.
     """
-    is_staged = isinstance(jnp.zeros(()), jax.core.Tracer)
-    return jax.ensure_compile_time_eval() if is_staged else contextlib.nullcontext()
+    return jax.ensure_compile_time_eval() if is_staged() else contextlib.nullcontext()
+
+
+def is_staged() -> bool:
+    """Whether a `jit` is being traced, in which even what is computed from known values is not known."""
+    return isinstance(jnp.zeros(()), jax.core.Tracer)
 
 
 def real_array(name: str, value: Any) -> jax.Array:

@@ -454,3 +454,11 @@ def test_a_traced_rotation_that_is_none_is_bad_input():
 def test_what_is_no_pose_is_told_in_one_line(pose):
     with pytest.raises(ValueError, match=r"^pose must be a pk_jax\.SE3, got \w+$"):
         pk.inverse_kinematics(SEMI, pose)
+
+
+@pytest.mark.parametrize("rows", [(), (3,)])
+def test_known_rows_inside_a_jit_are_solved_there(rows):
+    pose = SEMI.home()[0]
+    q = np.broadcast_to(np.asarray(SEMI.home()[1]), (*rows, 6))
+    height = jax.jit(lambda x: x * pk.forward_kinematics(SEMI, q, pose).pose.translation[..., 2])(2.0)
+    np.testing.assert_allclose(height, np.full(rows, 2.0), rtol=1e-12)

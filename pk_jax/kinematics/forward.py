@@ -67,8 +67,8 @@ def forward_kinematics(mech: Mechanism, joints: Any, guess: Any = None) -> Forwa
     function theorem; zero on rows that are not OK.
     """
     require_mechanism("forward_kinematics", mech)
-    if checks.is_concrete((mech, joints, guess)):
-        return _known(mech, joints, guess)
+    if checks.is_concrete((mech, joints, guess)) and (found := _known(mech, joints, guess)) is not None:
+        return found
     home_pose, home_joints = home_shapes(mech)
     joints, many = rows_of("joints", joints, home_joints)
     home, order = rows.prepared(mech)[:2] if checks.is_concrete(mech) else (None, None)
@@ -209,17 +209,22 @@ def _answer(
 # --- known values: rows in blocks, whatever their number
 
 
-def _known(mech: Mechanism, joints: Any, guess: Any) -> ForwardKinematics:
+def _known(mech: Mechanism, joints: Any, guess: Any) -> ForwardKinematics | None:
+    """The answer; None inside of a `jit`, where known values, too, must be traced."""
     home, order, (home_pose, home_joints) = rows.prepared(mech)[:3]
     joints, many = rows_of("joints", joints, home_joints, numpy=True)
     guess, guesses = (None, False) if guess is None else rows_of("guess", guess, home_pose, numpy=True)
     if not (many or guesses):
         found = _one_known(mech, home, joints, guess, order)
+        if isinstance(found.status, jax.core.Tracer):  # cheaper to see now than to ask before
+            return None
         if int(found.status) != Status.STALLED:
             return found
         joints, guess, found = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (joints, guess, found))
         found = _again(mech, home, joints, guess, found)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), found)
+    if checks.is_staged():
+        return None
     if many and guesses:
         same_size((joints, guess), (True, True))
     elif guesses:

@@ -224,7 +224,7 @@ def test_lengths_in_another_unit_are_warned_of_in_one_line(run, here):
     code, out, err = run("fk", "nam-2-rpr", "a.csv", "--chunk", "8")
     told = [line for line in err.splitlines() if "are they in one unit?" in line]
     assert code == 0 and out.count("UNREACHABLE") == 20
-    assert len(told) == 1 and told[0].startswith("pk-jax: warning: joints are")
+    assert len(told) == 1 and told[0].startswith("pk-jax: warning: joints and those of")
 
 
 # What is wrong

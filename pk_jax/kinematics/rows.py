@@ -20,7 +20,7 @@ from pk_jax.kinematics.batching import home_shapes
 from pk_jax.kinematics.compiled import FULL, Options, compiled
 from pk_jax.kinematics.elimination import Order
 from pk_jax.kinematics.lane_newton import Attempt, Home, at_home, attempt, home_from, order_of
-from pk_jax.kinematics.lanes import Entries, split, split_rows
+from pk_jax.kinematics.lanes import Entries, is_entries, split, split_rows
 from pk_jax.mechanisms.base import Mechanism
 
 BLOCK = 8192  # rows of one call at most; on an accelerator they are the lanes, all at once
@@ -189,17 +189,12 @@ def program(
 
 def values_of(found: Attempt, dtype: Any) -> jax.Array:
     """Everything that an attempt says, as one array of lanes. -> (values, lanes)"""
-    poses = [
-        item
-        for leaf in jax.tree.leaves(found.pose, is_leaf=lambda e: isinstance(e, Entries))
-        for item in leaf.items
-    ]
+    poses = [item for leaf in jax.tree.leaves(found.pose, is_leaf=is_entries) for item in leaf.items]
     return jnp.stack([item.astype(dtype) for item in (*poses, *found[1:])])
 
 
 def _as_pose(flat: Entries, like: Any) -> Any:
     """A pose of `Entries` like another, from all its entries in a row."""
-    is_entries = lambda leaf: isinstance(leaf, Entries)
     leaves, tree = jax.tree.flatten(like, is_leaf=is_entries)
     items, parts = iter(flat.items), []
     for leaf in leaves:

@@ -212,6 +212,7 @@ def _optimize(options: argparse.Namespace) -> int:
 def _mechanism(options: argparse.Namespace):
     """The 2-RPR or 2-RRR that the options describe, eqs. (20) and (22) filled in."""
     import pk_jax as pk
+    from pk_jax.files.named import named_mechanism
 
     if options.mechanism in ("2-rpr", "2-rrr"):
         if options.l_min is None:
@@ -225,8 +226,8 @@ def _mechanism(options: argparse.Namespace):
         proximal = r if options.proximal is None else options.proximal
         return pk.FiveBar(half_base=r, proximal=proximal, distal=l_max - proximal, reach=(l_min, l_max))
     if options.l_min is not None or options.l_max is not None or options.proximal is not None:
-        raise ValueError(f"{options.mechanism} is a catalogue entry and takes no lengths")
-    return pk.catalogued(options.mechanism)
+        raise ValueError(f"{options.mechanism} has its own lengths and takes no others")
+    return named_mechanism(options.mechanism).mechanism
 
 
 def _list(options: argparse.Namespace) -> int:
@@ -296,7 +297,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--out", default="runs/nam2006", metavar="DIR", help="run folder (default: %(default)s)")
 
     sub = command("workspace", _workspace, "GII, GRI and SUI of a 2-RPR or 2-RRR")
-    sub.add_argument("mechanism", help="2-rpr, 2-rrr, or a catalogue entry (see: pk-jax list)")
+    sub.add_argument("mechanism", help="2-rpr, 2-rrr, a catalogue entry (see: pk-jax list) or a TOML file")
     sub.add_argument("--half-base", type=float, default=1.0, help="R (default: 1)")
     sub.add_argument("--l-min", type=float, help="least distance from a base joint to the end point")
     sub.add_argument("--l-max", type=float, help="greatest distance (default: l_min + 2 R, eq. 20)")

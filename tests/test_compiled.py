@@ -8,7 +8,8 @@ from jax import lax
 
 import pk_jax as pk
 from pk_jax.kinematics import compiled, rows
-from pk_jax.kinematics.lanes import Entries, Invariants, entrywise, split
+from pk_jax.kinematics.entrywise import Invariants, entrywise
+from pk_jax.kinematics.lanes import Entries, split
 
 ARMS = pk.FiveBar(half_base=1.0, proximal=1.0, distal=2.15)
 JOINTS = np.asarray(ARMS.home()[1]) + np.linspace(-0.3, 0.3, 130)[:, None] * [1.0, -0.7]

@@ -13,7 +13,8 @@ import pk_jax as pk
 from pk_jax.geometry.poses import retract, tangent_zero
 from pk_jax.kinematics import elimination
 from pk_jax.kinematics.closure import closure
-from pk_jax.kinematics.lanes import Entries, entrywise, is_known, split, stack, unknown_primitives
+from pk_jax.kinematics.entrywise import entrywise, unknown_primitives
+from pk_jax.kinematics.lanes import Entries, is_known, split, stack
 
 X = np.random.default_rng(0).uniform(0.1, 0.9, (3, 4))  # what every elementary function is defined on
 M = np.random.default_rng(1).uniform(-1, 1, (4, 4))

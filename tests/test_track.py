@@ -246,3 +246,9 @@ def test_derivatives_in_the_lengths_and_the_geometry():
     assert all(np.all(np.isfinite(leaf)) for leaf in (in_mech.base, in_mech.platform, in_path))
     np.testing.assert_array_equal(in_path[11:], 0)
     np.testing.assert_allclose(in_path[:11], gradient(SEMI, PATH)[1][:11], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("closest", [np.nan, np.inf, -1e-3, 1.0, "near", [1e-4, 1e-3]])
+def test_a_threshold_that_is_none_is_refused(closest):
+    with pytest.raises(ValueError, match="^closest must"):
+        pk.track(SEMI, np.ones((2, 6)), closest=closest)

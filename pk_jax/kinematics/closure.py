@@ -12,6 +12,7 @@ from pk_jax.kinematics.jacobian import joint_jacobian, units
 from pk_jax.mechanisms.base import Mechanism
 
 ROUNDOFFS = 256  # the residual of an exact configuration may be this many roundings of its terms
+INCONSISTENT_ABOVE = 1e-6  # of the size of each closure equation, for redundant mechanisms
 
 
 def pose_scale(mech: Mechanism, pose: Any) -> jax.Array:
@@ -27,7 +28,26 @@ def joint_scale(mech: Mechanism, joints: jax.Array) -> jax.Array:
     return jnp.where(unit > 0, mech.length() + jnp.max(jnp.abs(joints) * unit), 1)
 
 
-def closure(
+def closure(mech: Mechanism, pose: Any, joints: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """F (c,), A (c, n), and () whether the equations hold: to roundoff, or redundant ones to 1e-6."""
+    value, jacobian, size, of_pose = _sizes(mech, pose, joints)
+    if jacobian.shape[0] == jacobian.shape[1]:
+        return value, jacobian, _is_within(value, closed_to(value.dtype) * size)
+    return value, jacobian, _is_within(value, INCONSISTENT_ABOVE * of_pose)
+
+
+def is_closed(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
+    """() True where every closure equation holds to roundoff: |F_i| against the size of its terms."""
+    value, _, size, _ = _sizes(mech, pose, joints)
+    return _is_within(value, closed_to(value.dtype) * size)
+
+
+def closed_to(dtype: Any) -> float:
+    """|F_i| of an exact configuration, over the size of the terms of equation i."""
+    return ROUNDOFFS * float(jnp.finfo(dtype).eps)
+
+
+def _sizes(
     mech: Mechanism, pose: Any, joints: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """F (c,), A (c, n), the size of the terms of each equation (c,), and of those of its pose alone (c,)."""
@@ -37,12 +57,5 @@ def closure(
     return value, jacobian, of_pose + of_joints, of_pose
 
 
-def closed_to(dtype: Any) -> float:
-    """|F_i| of an exact configuration, over the size of the terms of equation i."""
-    return ROUNDOFFS * float(jnp.finfo(dtype).eps)
-
-
-def is_closed(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
-    """() True where every closure equation holds to roundoff: |F_i| against the size of its terms."""
-    value, _, size, _ = closure(mech, pose, joints)
-    return jnp.all(jnp.abs(value) <= closed_to(value.dtype) * size)
+def _is_within(value: jax.Array, allowed: jax.Array) -> jax.Array:
+    return jnp.all(jnp.abs(value) <= allowed)

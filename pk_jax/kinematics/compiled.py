@@ -1,9 +1,9 @@
 """Compiling with the options of XLA that pay for lanes.
 
-On a CPU, XLA evaluates shared values again for each output of a fusion (six times the arithmetic, for a
-Newton step) and starts every fusion of a loop's body by itself. Two backend options end that. They
-would slow other programs down, and `jax.jit` passes on neither, so they are set for these programs alone,
-through what `jax.extend` gives. Where that fails, the program is compiled the ordinary way: slower, as right.
+On a CPU, XLA evaluates shared values again for each output of a fusion, and starts every fusion of a
+loop's body by itself. Two backend options end that. They would slow other programs down, and `jax.jit`
+passes on neither, so they are set for these programs alone, through what `jax.extend` gives. Where that
+fails, the program is compiled the ordinary way: slower, as right.
 """
 
 from __future__ import annotations

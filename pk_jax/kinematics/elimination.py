@@ -1,6 +1,6 @@
 """Small linear systems on lanes: elimination in a fixed order of pivots, and orthogonalization.
 
-Choosing pivots lane by lane costs a hundred times the elimination. The order is chosen once, by
+Choosing pivots lane by lane costs far more than the elimination. The order is chosen once, by
 complete pivoting at a reference matrix, and holds in its neighbourhood; a lane on which it fails shows
 in its residual and is solved again by other means. Where the reference is traced, its inverse takes
 the part of the order: near it, inverse @ matrix is near the identity and needs no pivots.

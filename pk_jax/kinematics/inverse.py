@@ -15,8 +15,9 @@ from pk_jax.geometry.poses import is_pose, pose_units, position, settle
 from pk_jax.kinematics import newton
 from pk_jax.kinematics.batching import all_finite, home_shapes, over_rows, rows_of, where
 from pk_jax.kinematics.closure import is_closed, joint_scale
+from pk_jax.kinematics.entrywise import entrywise
 from pk_jax.kinematics.jacobian import SINGULAR_BELOW, joint_jacobian, scaled_jacobians
-from pk_jax.kinematics.lanes import entrywise, is_known, split
+from pk_jax.kinematics.lanes import is_known, split
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
 

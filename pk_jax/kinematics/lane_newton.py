@@ -17,16 +17,16 @@ from jax import lax
 
 from pk_jax.geometry.poses import is_pose, pose_units, retract, settle
 from pk_jax.kinematics import elimination
-from pk_jax.kinematics.closure import closed_to, closure, pose_scale
+from pk_jax.kinematics.closure import closure, pose_scale
 from pk_jax.kinematics.elimination import Matrix, Order, Reference
-from pk_jax.kinematics.jacobian import SINGULAR_BELOW, units
-from pk_jax.kinematics.lanes import Entries, Invariants, Lane, entrywise, is_entries, over, times, total
+from pk_jax.kinematics.entrywise import Invariants, entrywise
+from pk_jax.kinematics.jacobian import SINGULAR_BELOW, scaled_jacobians, units
+from pk_jax.kinematics.lanes import Entries, Lane, is_entries, items_of, over, rebuilt, times, total
 from pk_jax.mechanisms.base import Mechanism
 from pk_jax.status import Status
 
 STEPS = 10
 LONGEST_STEP = 0.5  # of the natural size of each coordinate
-INCONSISTENT_ABOVE = 1e-6  # of the size of each closure equation, for redundant mechanisms
 
 
 class Ended(NamedTuple):
@@ -76,7 +76,7 @@ def attempt(
     if kind.joints_are_distances:
         is_given = reduce(jnp.logical_and, [q > 0 for q in joints.items], is_given)
     if not is_home:
-        finite = [jnp.isfinite(x) for leaf in jax.tree.leaves(start, is_leaf=is_entries) for x in leaf.items]
+        finite = [jnp.isfinite(x) for x in items_of(start)]
         is_given = reduce(jnp.logical_and, [*finite, *entrywise(is_pose, start).items], is_given)
         start = entrywise(settle, _where(is_given, start, home.pose))
     joints = _where(is_given, joints, home.joints)  # lost rows work at home and are masked after
@@ -184,24 +184,25 @@ def iterate(
     invariants = Invariants(mech, joints)
     entrywise(linearize, mech, start, joints, invariants=invariants)
     taken = int(first is not None)
-    items, shape = _items(pose, like)
+    items = _spread(items_of(pose), like)
 
     def is_running(state):
         return (state[0] < STEPS - taken) & ~jnp.all(state[3])
 
     def advance(state):
         k, items, steps, has_stopped, is_stationary = state
-        pose = _pose(items, shape)
+        pose = rebuilt(items, start)
         value, jacobian = entrywise(linearize, mech, pose, joints, invariants=invariants)
         pose, longest = moved(pose, _least_squares(jacobian.rows(), value.items, by))
-        items = [jnp.where(has_stopped, *each) for each in zip(items, _items(pose, like)[0], strict=True)]
+        new = _spread(items_of(pose), like)
+        items = [jnp.where(has_stopped, *each) for each in zip(items, new, strict=True)]
         steps = jnp.where(has_stopped, steps, steps + 1)
         is_stationary = is_stationary | (~has_stopped & (longest < small))
         return k + 1, items, steps, is_stationary | jnp.isnan(longest), is_stationary
 
     none, count = jnp.zeros(like.shape, bool), jnp.full(like.shape, taken, jnp.int32)
     _, items, steps, _, is_stationary = lax.while_loop(is_running, advance, (0, items, count, none, none))
-    return Ended(_pose(items, shape), is_stationary, steps)
+    return Ended(rebuilt(items, start), is_stationary, steps)
 
 
 def judge(
@@ -209,13 +210,10 @@ def judge(
 ) -> Judged:
     """The equations at `pose`, evaluated afresh, and how far from a singularity it is."""
     like = joints.items[0]
-    value, jacobian, size, of_pose = entrywise(closure, mech, pose, joints)
+    value, jacobian, is_closed = entrywise(closure, mech, pose, joints)
     rows = jacobian.rows()
     residual = jnp.sqrt(total([times(f, f) for f in value.items]))
     is_square = len(rows) == len(rows[0])
-    allowed, sizes = (closed_to(like.dtype), size) if is_square else (INCONSISTENT_ABOVE, of_pose)
-    within = [jnp.abs(f) <= allowed * s for f, s in zip(value.items, sizes.items, strict=True)]
-    is_closed = reduce(jnp.logical_and, within)
 
     factors = None if by is None else elimination.factor(rows[:actuated], by)
     sign = jnp.zeros_like(like) if factors is None else factors.sign()
@@ -236,20 +234,15 @@ def judge(
         columns = [elimination.back_substitute(upper, [float(i == k) for i in range(n)]) for k in range(n)]
         entries = [item for column in columns for item in column]
     sigma = 1 / jnp.sqrt(total([times(a, a) for a in entries]))
-    return Judged(residual, is_closed, jnp.where(jnp.isfinite(sigma), sigma, 0), sign)
+    return Judged(residual, is_closed.items[0], jnp.where(jnp.isfinite(sigma), sigma, 0), sign)
 
 
 def judge_one(mech: Mechanism, joints: jax.Array, pose: Any) -> Judged:
     """The same for one row, in ordinary arrays: for where compiling costs more than computing."""
-    value, jacobian, size, of_pose = closure(mech, pose, joints)
-    is_square = jacobian.shape[0] == jacobian.shape[1]
-    allowed = closed_to(value.dtype) * size if is_square else INCONSISTENT_ABOVE * of_pose
-    scaled = jacobian * _column_units(mech, pose)
-    norms = jnp.linalg.norm(scaled, axis=1, keepdims=True)
-    sigmas = jnp.linalg.svd(scaled / jnp.where(norms > 0, norms, 1), compute_uv=False)
+    value, jacobian, is_closed = closure(mech, pose, joints)
+    sigmas = jnp.linalg.svd(scaled_jacobians(mech, pose, joints).pose, compute_uv=False)
     sigma = 1 / jnp.sqrt(jnp.sum(1 / sigmas**2))
-    sign = sign_of_det(jacobian, mech.actuated_rows)
-    return Judged(jnp.linalg.norm(value), jnp.all(jnp.abs(value) <= allowed), sigma, sign)
+    return Judged(jnp.linalg.norm(value), is_closed, sigma, sign_of_det(jacobian, mech.actuated_rows))
 
 
 def start_sign(mech: Any, joints: Entries, start: Any, by: Order | Reference, actuated: int | None) -> Lane:
@@ -283,22 +276,6 @@ def _where(condition: Lane, chosen: Any, other: Any) -> Any:
     return jax.tree.map(choose, chosen, other, is_leaf=is_entries)
 
 
-def _items(pose: Any, like: Lane) -> tuple[list[Lane], Any]:
-    """Every entry of a pose as a lane, and what puts them together again."""
-    leaves, tree = jax.tree.flatten(pose, is_leaf=is_entries)
-    items = [
-        jnp.broadcast_to(jnp.asarray(item, like.dtype), like.shape) for leaf in leaves for item in leaf.items
-    ]
-    return items, (tree, [leaf.shape for leaf in leaves])
-
-
-def _pose(items: list[Lane], shape: Any) -> Any:
-    tree, shapes = shape
-    items = iter(items)
-    leaves = []
-    for each in shapes:
-        count = 1
-        for size in each:
-            count *= size
-        leaves.append(Entries(each, [next(items) for _ in range(count)]))
-    return jax.tree.unflatten(tree, leaves)
+def _spread(items: list[Lane], like: Lane) -> list[Lane]:
+    """Every item as a whole lane."""
+    return [jnp.broadcast_to(jnp.asarray(item, like.dtype), like.shape) for item in items]

@@ -12,10 +12,11 @@ from jax import lax
 from pk_jax.geometry.poses import difference, retract, tangent_size, tangent_zero
 from pk_jax.geometry.spread import evenly
 from pk_jax.kinematics.closure import is_closed, joint_scale, pose_scale
+from pk_jax.kinematics.entrywise import entrywise
 from pk_jax.kinematics.forward import forward_kinematics
 from pk_jax.kinematics.inverse import inverse_kinematics
 from pk_jax.kinematics.jacobian import joint_jacobian, pose_jacobian, scaled_jacobians
-from pk_jax.kinematics.lanes import entrywise, split, stack
+from pk_jax.kinematics.lanes import split, stack
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
 

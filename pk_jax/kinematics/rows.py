@@ -20,7 +20,7 @@ from pk_jax.kinematics.batching import home_shapes
 from pk_jax.kinematics.compiled import FULL, Options, compiled
 from pk_jax.kinematics.elimination import Order
 from pk_jax.kinematics.lane_newton import Attempt, Home, at_home, attempt, home_from, order_of
-from pk_jax.kinematics.lanes import Entries, is_entries, split, split_rows
+from pk_jax.kinematics.lanes import items_of, rebuilt, split, split_rows
 from pk_jax.mechanisms.base import Mechanism
 
 BLOCK = 8192  # rows of one call at most; on an accelerator they are the lanes, all at once
@@ -138,7 +138,7 @@ def _order_in_use(tree: Any, shapes: tuple, order: Order | None) -> Order | None
     """The order of pivots, for the first few geometries of a family that need another one.
 
     Every order is another program. From then on one program serves all geometries: without an
-    order, by the inverse at home, half as fast, and nothing more to compile.
+    order, by the inverse at home; slower, but nothing more to compile.
     """
     seen = _orders_seen.setdefault((tree, shapes), [])
     if order not in seen and len(seen) < ORDERS:
@@ -176,7 +176,7 @@ def program(
             at = lambda rows: split_rows(lax.dynamic_slice_in_dim(rows, k * lanes, lanes))
             begin = home.pose
             if start != "home":
-                begin = _as_pose(split(guess) if start == "one" else at(guess), home.pose)
+                begin = rebuilt((split(guess) if start == "one" else at(guess)).items, home.pose)
             found = attempt(entries, at(joints), begin, home, order, kind=kind, is_home=start == "home")
             return lax.dynamic_update_slice_in_dim(out, values_of(found, dtype)[None], k, 0)
 
@@ -189,17 +189,7 @@ def program(
 
 def values_of(found: Attempt, dtype: Any) -> jax.Array:
     """Everything that an attempt says, as one array of lanes. -> (values, lanes)"""
-    poses = [item for leaf in jax.tree.leaves(found.pose, is_leaf=is_entries) for item in leaf.items]
-    return jnp.stack([item.astype(dtype) for item in (*poses, *found[1:])])
-
-
-def _as_pose(flat: Entries, like: Any) -> Any:
-    """A pose of `Entries` like another, from all its entries in a row."""
-    leaves, tree = jax.tree.flatten(like, is_leaf=is_entries)
-    items, parts = iter(flat.items), []
-    for leaf in leaves:
-        parts.append(Entries(leaf.shape, [next(items) for _ in leaf.items]))
-    return jax.tree.unflatten(tree, parts)
+    return jnp.stack([item.astype(dtype) for item in (*items_of(found.pose), *found[1:])])
 
 
 def _aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray:

@@ -21,8 +21,9 @@ from pk_jax.kinematics.batching import (
     without_derivatives,
 )
 from pk_jax.kinematics.closure import pose_scale
+from pk_jax.kinematics.entrywise import entrywise
 from pk_jax.kinematics.forward import with_derivatives
-from pk_jax.kinematics.lanes import Entries, entrywise, is_entries, split, stack, times
+from pk_jax.kinematics.lanes import Entries, is_entries, split, stack, times
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
 
@@ -64,6 +65,12 @@ def track(mech: Mechanism, joints_path: Any, start: Any = None, *, closest: floa
         start, many = rows_of("start", start, home_pose)
         if many:
             raise ValueError("start must be one pose; vmap track for many paths")
+    closest = checks.real_array("closest", closest)
+    checks.has_shape("closest", closest, ())
+    if checks.is_concrete(closest) and not 0 <= float(closest) < 1:
+        raise ValueError(
+            f"closest must be in [0, 1), a singular value without units, got {float(closest):.6g}"
+        )
     path = path.astype(home_joints.dtype)
     home, order = rows.prepared(mech)[:2] if checks.is_concrete(mech) else (None, None)
     count = path.shape[0]

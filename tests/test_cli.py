@@ -47,6 +47,13 @@ def test_workspace(capsys):
     assert abs(float(values["area"]) - 7.280993404) < 1e-8
     code, out, _ = run(capsys, "workspace", "nam-2-rpr", "--rule", "paper")
     assert code == 0 and "gri  0.80423" in out and "+-" not in out
+
+
+def test_workspace_of_a_file_is_that_of_its_mechanism(capsys, tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text('family = "TwoRPR"\nunit = "1"\nhalf_base = 1.0\nl_min = 1.0\nl_max = 3.0\n')
+    ours, named = (run(capsys, "workspace", each, "--rule", "paper") for each in (str(file), "nam-2-rpr"))
+    assert ours == named and named[0] == 0
     code, out, _ = run(
         capsys, "workspace", "2-rpr", "--l-min", "300", "--half-base", "100", "--nodes", "12", "9"
     )

@@ -250,5 +250,5 @@ def test_derivatives_in_the_lengths_and_the_geometry():
 
 @pytest.mark.parametrize("closest", [np.nan, np.inf, -1e-3, 1.0, "near", [1e-4, 1e-3]])
 def test_a_threshold_that_is_none_is_refused(closest):
-    with pytest.raises(ValueError, match="^closest must"):
+    with pytest.raises(ValueError, match=r"^closest must"):
         pk.track(SEMI, np.ones((2, 6)), closest=closest)

@@ -31,6 +31,14 @@ if TYPE_CHECKING:
     from pk_jax.kinematics.jacobian import pose_jacobian as pose_jacobian
     from pk_jax.kinematics.jacobian import velocity_jacobian as velocity_jacobian
     from pk_jax.kinematics.laws import check_mechanism as check_mechanism
+    from pk_jax.kinematics.statics import BoundedForces as BoundedForces
+    from pk_jax.kinematics.statics import Screws as Screws
+    from pk_jax.kinematics.statics import bounded_joint_forces as bounded_joint_forces
+    from pk_jax.kinematics.statics import joint_forces as joint_forces
+    from pk_jax.kinematics.statics import platform_wrench as platform_wrench
+    from pk_jax.kinematics.statics import preloads as preloads
+    from pk_jax.kinematics.statics import screws as screws
+    from pk_jax.kinematics.statics import stiffness as stiffness
     from pk_jax.kinematics.track import Track as Track
     from pk_jax.kinematics.track import track as track
     from pk_jax.mechanisms.base import LegMechanism as LegMechanism
@@ -38,6 +46,9 @@ if TYPE_CHECKING:
     from pk_jax.mechanisms.base import Skeleton as Skeleton
     from pk_jax.mechanisms.catalogue import catalogued as catalogued
     from pk_jax.mechanisms.five_bar import FiveBar as FiveBar
+    from pk_jax.mechanisms.planar_rpr import PlanarRPR as PlanarRPR
+    from pk_jax.mechanisms.planar_rrr import PlanarRRR as PlanarRRR
+    from pk_jax.mechanisms.six_link import SixLink as SixLink
     from pk_jax.mechanisms.stewart import Stewart as Stewart
     from pk_jax.mechanisms.two_rpr import TwoRPR as TwoRPR
     from pk_jax.precision import enable_x64 as enable_x64
@@ -86,6 +97,16 @@ _NAMES = {
         "velocity_jacobian",
     ),
     "pk_jax.kinematics.laws": ("check_mechanism",),
+    "pk_jax.kinematics.statics": (
+        "BoundedForces",
+        "Screws",
+        "bounded_joint_forces",
+        "joint_forces",
+        "platform_wrench",
+        "preloads",
+        "screws",
+        "stiffness",
+    ),
     "pk_jax.kinematics.track": (
         "Track",
         "track",
@@ -97,6 +118,9 @@ _NAMES = {
     ),
     "pk_jax.mechanisms.catalogue": ("catalogued",),
     "pk_jax.mechanisms.five_bar": ("FiveBar",),
+    "pk_jax.mechanisms.planar_rpr": ("PlanarRPR",),
+    "pk_jax.mechanisms.planar_rrr": ("PlanarRRR",),
+    "pk_jax.mechanisms.six_link": ("SixLink",),
     "pk_jax.mechanisms.stewart": ("Stewart",),
     "pk_jax.mechanisms.two_rpr": ("TwoRPR",),
     "pk_jax.precision": ("enable_x64",),

@@ -50,6 +50,9 @@ def refused(build, *words, **fields):
 @pytest.mark.parametrize("bad", NOT_A_LENGTH.values(), ids=NOT_A_LENGTH.keys())
 @each_field
 def test_every_length_is_checked(mechanism, good, field, bad):
+    if (mechanism, field, bad) == (pk.FiveBar, "half_base", 0.0):
+        assert float(mechanism(**{**good, field: bad}).length()) == good["proximal"]  # a coaxial five-bar
+        return
     refused(mechanism, f"{mechanism.__name__}.{field} ", **{**good, field: bad})
 
 

@@ -41,11 +41,10 @@ def local_indices(mech: Mechanism, pose: Any, branch: Any = None) -> LocalIndice
     point, the derivative of the isotropy is the mean of the directional ones, 0.
     """
     require_mechanism("local_indices", mech)
-    home_pose, home_joints = home_shapes(mech)
-    pose, many = rows_of("pose", pose, home_pose)
+    pose, many = rows_of("pose", pose, home_shapes(mech)[0])
     if branch is None:
         return _local(mech, (pose,), (many,))
-    branch, branches = branch_rows(branch, home_joints)
+    branch, branches = branch_rows(mech, branch)
     return _local(mech, (pose, branch), (many, branches))
 
 

@@ -31,10 +31,15 @@ from pk_jax import checks
 from pk_jax.files.atomic import write_atomically
 from pk_jax.mechanisms.base import Mechanism
 from pk_jax.mechanisms.five_bar import FiveBar
+from pk_jax.mechanisms.planar_rpr import PlanarRPR
+from pk_jax.mechanisms.planar_rrr import PlanarRRR
+from pk_jax.mechanisms.six_link import SixLink
 from pk_jax.mechanisms.stewart import Stewart
 from pk_jax.mechanisms.two_rpr import TwoRPR
 
-FAMILIES: dict[str, type[Mechanism]] = {"Stewart": Stewart, "FiveBar": FiveBar, "TwoRPR": TwoRPR}
+FAMILIES: dict[str, type[Mechanism]] = {
+    family.__name__: family for family in (Stewart, PlanarRRR, PlanarRPR, SixLink, FiveBar, TwoRPR)
+}
 UNITS = {  # metres; "1" is for lengths over a length of reference
     "m": Decimal(1),
     "mm": Decimal("0.001"),

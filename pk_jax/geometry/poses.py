@@ -2,21 +2,40 @@
 
 A pose is an array of coordinates, moved by addition: (x, y) and (x, y, z) are translations,
 (x, y, phi) with planar points is a planar rigid motion whose tangent is (x', y', phi'). Or it is
-an `SE3`, moved by a translation and a rotation in base axes.
+an `SE3`, moved by a translation and a rotation in base axes. Solvers carry planar rigid motions as
+`Turned`, which moves without a cosine.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from pk_jax.geometry.planar import rotation
+from pk_jax.geometry.planar import cross, direction, rotation, turn_onto
 from pk_jax.geometry.rotations import cayley
 from pk_jax.geometry.se3 import ORTHONORMAL_TO, SE3
 
-Pose = Any  # jax.Array or SE3
+Pose = Any  # jax.Array or SE3; inside of solvers also Turned
+
+
+class Turned(NamedTuple):
+    """A planar rigid motion with the tangent of (x, y, phi)."""
+
+    translation: jax.Array  # (2,)
+    direction: jax.Array  # (2,) cos(phi), sin(phi)
+
+
+def turned(pose: jax.Array) -> Turned:
+    """(x, y, phi) without its angle."""
+    return Turned(pose[:2], direction(pose[2]))
+
+
+def unturned(pose: Turned, near: jax.Array) -> jax.Array:
+    """(x, y, phi), phi within half a turn of that of the pose `near` (3,)."""
+    u, v = direction(near[2]), pose.direction
+    return jnp.append(pose.translation, near[2] + jnp.arctan2(cross(u, v), jnp.sum(u * v)))
 
 
 def is_pose(pose: Pose) -> jax.Array:
@@ -43,6 +62,11 @@ def retract(pose: Pose, twist: jax.Array) -> Pose:
     if isinstance(pose, SE3):
         moved = (pose.translation + twist[:3], cayley(twist[3:]) @ pose.rotation)
         return jax.tree.unflatten(jax.tree.structure(pose), moved)
+    if isinstance(pose, Turned):  # Cayley's map in the plane
+        (c, s), half = pose.direction, twist[2] / 2
+        cosine, sine = (1 - half * half) / (1 + half * half), 2 * half / (1 + half * half)
+        around = jnp.stack([c * cosine - s * sine, s * cosine + c * sine])
+        return Turned(pose.translation + twist[:2], around)
     return pose + twist
 
 
@@ -57,7 +81,9 @@ def difference(pose: Pose, other: Pose) -> jax.Array:
 
 def tangent_size(pose: Pose) -> int:
     """n, the number of degrees of freedom."""
-    return 6 if isinstance(pose, SE3) else pose.shape[0]
+    if isinstance(pose, SE3):
+        return 6
+    return 3 if isinstance(pose, Turned) else pose.shape[0]
 
 
 def tangent_zero(pose: Pose) -> jax.Array:
@@ -67,13 +93,15 @@ def tangent_zero(pose: Pose) -> jax.Array:
 
 def position(pose: Pose) -> jax.Array:
     """The coordinates of the pose that are not a rotation matrix. -> (d,)"""
-    return pose.translation if isinstance(pose, SE3) else pose
+    return pose.translation if isinstance(pose, SE3 | Turned) else pose
 
 
 def pose_units(pose: Pose, declared: tuple[int, ...] | None) -> tuple[int, ...]:
     """1 = length, 0 = angle, for every tangent coordinate; undeclared means all lengths."""
     if isinstance(pose, SE3):
         return (1, 1, 1, 0, 0, 0)
+    if isinstance(pose, Turned):
+        return (1, 1, 0)
     return (1,) * pose.shape[0] if declared is None else declared
 
 
@@ -82,6 +110,8 @@ def place(pose: Pose, points: jax.Array) -> jax.Array:
     count, dimension = points.shape
     if isinstance(pose, SE3):
         return pose.translation + points @ pose.rotation.T
+    if isinstance(pose, Turned):
+        return pose.translation + points @ turn_onto(pose.direction).T
     if pose.shape == (dimension,):
         return pose + points
     if pose.shape == (3,) and dimension == 2:

@@ -50,6 +50,14 @@ def rows_of(name: str, value: Any, one: Any, *, numpy: bool = False) -> tuple[An
     return array, array.ndim > one.ndim
 
 
+def configurations(mech: Mechanism, pose: Any, joints: Any) -> tuple[tuple[Any, Any], tuple[bool, bool]]:
+    """Pose and joints as arrays, one or many, and which of them are batched."""
+    pose_like, joints_like = home_shapes(mech)
+    pose, poses = rows_of("pose", pose, pose_like)
+    joints, many = rows_of("joints", joints, joints_like)
+    return (pose, joints), (poses, many)
+
+
 _PARTS = ("translation", "rotation")
 
 

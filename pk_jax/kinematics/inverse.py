@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
+import itertools
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,10 +15,9 @@ from pk_jax import checks
 from pk_jax.geometry.poses import is_pose, pose_units, position, settle
 from pk_jax.kinematics import newton
 from pk_jax.kinematics.batching import all_finite, home_shapes, over_rows, rows_of, where
+from pk_jax.kinematics.blocks import has_one_joint_an_equation, joint_blocks
 from pk_jax.kinematics.closure import is_closed, joint_scale
-from pk_jax.kinematics.entrywise import entrywise
 from pk_jax.kinematics.jacobian import SINGULAR_BELOW, joint_jacobian, scaled_jacobians
-from pk_jax.kinematics.lanes import is_known, split
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
 
@@ -36,7 +36,8 @@ def inverse_kinematics(
     """Joints that hold the platform at `pose`, in one working mode.
 
     pose:    like the mechanism's, or batched on a leading axis
-    branch:  signs of the working mode, (m,) or (batch, m); default: the mechanism's own
+    branch:  signs of the working mode, (s,) or (batch, s), as many as the mechanism's own, which is the
+             default
     free:    values of kinematically redundant joints, for mechanisms that have them
 
     Status: OK: closed to roundoff; UNREACHABLE: no real joints; SINGULAR: a type I singularity (a leg
@@ -47,13 +48,12 @@ def inverse_kinematics(
     The derivative of a row that is not OK is zero.
     """
     require_mechanism("inverse_kinematics", mech)
-    home_pose, home_joints = home_shapes(mech)
-    pose, many = rows_of("pose", pose, home_pose)
+    pose, many = rows_of("pose", pose, home_shapes(mech)[0])
     if checks.is_concrete((mech, pose)):
         _warn_of_units(mech, pose)
     if branch is None:
         return _solve(mech, (pose,), free, (many,))
-    branch, branches = branch_rows(branch, home_joints)
+    branch, branches = branch_rows(mech, branch)
     return _solve(mech, (pose, branch), free, (many, branches))
 
 
@@ -68,12 +68,28 @@ def _warn_of_units(mech: Mechanism, pose: Any) -> None:
         checks.warn_of_units(what, max(float(np.median(far)) / float(mech.length()), 1.0), stacklevel=3)
 
 
-def branch_rows(branch: Any, home_joints: jax.Array) -> tuple[jax.Array, bool]:
-    """Signs of a working mode, (m,) or (batch, m); ValueError where they are not signs."""
-    array, many = rows_of("branch", branch, home_joints)
+def branch_rows(mech: Mechanism, branch: Any) -> tuple[jax.Array, bool]:
+    """Signs of a working mode, (s,) or (batch, s); ValueError where they are not signs."""
+    array, many = rows_of("branch", branch, branch_shape(mech))
     if checks.is_concrete(array) and not np.all(np.abs(np.asarray(array)) == 1):
         raise ValueError(f"branch must hold only +1 and -1, got {np.asarray(array).tolist()}")
     return array, many
+
+
+def branch_shape(mech: Mechanism) -> jax.ShapeDtypeStruct:
+    """Shape and dtype of the signs of a working mode: the mechanism's own, or one sign a joint."""
+    shape = jax.eval_shape(lambda mech: mech.default_branch(), mech)
+    return home_shapes(mech)[1] if shape is None else shape
+
+
+def working_modes(mech: Mechanism) -> np.ndarray:
+    """Every working mode of the closed form, the default one first; one row of no signs for one mode. -> (2^s, s)"""
+    shape = jax.eval_shape(lambda mech: mech.default_branch(), mech)
+    if shape is None:
+        return np.zeros((1, 0))
+    with checks.known_values():
+        default = np.asarray(mech.default_branch())
+    return default * np.array(list(itertools.product((1.0, -1.0), repeat=shape.shape[0])), default.dtype)
 
 
 @partial(jax.jit, static_argnums=3)
@@ -113,25 +129,9 @@ def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = No
 def least_joint_sigma(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
     """Least singular value of B without units (`scaled_jacobians`). -> ()"""
     scaled = scaled_jacobians(mech, pose, joints).joints
-    leaves, tree = jax.tree.flatten((mech, pose, joints))
-    if _has_one_joint_a_leg(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves)):
+    if has_one_joint_an_equation(joint_blocks(mech, pose, joints)):
         return jnp.min(jnp.abs(jnp.diagonal(scaled)))
     return jnp.linalg.svd(scaled, compute_uv=False)[-1]
-
-
-@lru_cache(maxsize=256)
-def _has_one_joint_a_leg(tree: Any, leaves: tuple) -> bool:
-    """Whether B is diagonal: its other entries are known zeros, whatever the values are."""
-    answer = []
-
-    def look(*leaves):
-        jacobian = entrywise(joint_jacobian, *jax.tree.unflatten(tree, list(map(split, leaves))))
-        c, m = jacobian.shape
-        off = [jacobian.items[i * m + j] for i in range(c) for j in range(m) if i != j]
-        answer.append(c == m and all(is_known(item) and item == 0 for item in off))
-
-    jax.eval_shape(look, *(jax.ShapeDtypeStruct(*leaf) for leaf in leaves))
-    return answer[0]
 
 
 def _by_newton(mech: Mechanism, pose: jax.Array) -> jax.Array:

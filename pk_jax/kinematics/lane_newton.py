@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pk_jax.geometry.poses import is_pose, pose_units, retract, settle
+from pk_jax.geometry.poses import is_pose, pose_units, retract, settle, turned, unturned
 from pk_jax.kinematics import elimination
 from pk_jax.kinematics.closure import closure, pose_scale
 from pk_jax.kinematics.elimination import Matrix, Order, Reference
 from pk_jax.kinematics.entrywise import Invariants, entrywise
 from pk_jax.kinematics.jacobian import SINGULAR_BELOW, scaled_jacobians, units
 from pk_jax.kinematics.lanes import Entries, Lane, is_entries, items_of, over, rebuilt, times, total
-from pk_jax.mechanisms.base import Mechanism
+from pk_jax.mechanisms.base import LegMechanism, Mechanism
 from pk_jax.status import Status
 
 STEPS = 10
@@ -81,7 +81,12 @@ def attempt(
         start = entrywise(settle, _where(is_given, start, home.pose))
     joints = _where(is_given, joints, home.joints)  # lost rows work at home and are masked after
     by = eliminated_by(order, home)
-    ended = iterate(mech, joints, start, by, home.first.rows() if is_home else None, home.first.shape[1])
+    first, equations = home.first.rows() if is_home else None, home.first.shape[1]
+    is_turning = turns_a_platform(kind, mech)
+    carried = entrywise(turned, start) if is_turning else start
+    ended = iterate(mech, joints, carried, by, first, equations)
+    if is_turning:
+        ended = ended._replace(pose=entrywise(unturned, ended.pose, start))
     judged = judge(mech, joints, ended.pose, by, kind.actuated_rows)
     is_square = home.first.shape[0] == home.first.shape[1]
     det_sign = judged.sign * home.sign.items[0]
@@ -92,6 +97,17 @@ def attempt(
     status = jnp.where(is_given, status, Status.BAD_INPUT)
     steps = jnp.where(is_given, ended.steps, 0)
     return Attempt(ended.pose, status, judged.residual, steps, judged.sigma_min, det_sign)
+
+
+def turns_a_platform(kind: type[Mechanism], mech: Any) -> bool:
+    """Whether poses (x, y, phi) only carry platform points, so that the angle itself is not needed."""
+    if not issubclass(kind, LegMechanism):
+        return False
+    plain = kind.residual is LegMechanism.residual and kind.linearize is LegMechanism.linearize
+    given = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, float), mech, is_leaf=is_entries)
+    home, _ = jax.eval_shape(lambda mech: mech.home(), given)
+    points = jax.eval_shape(lambda mech: mech.attachments(), given)
+    return plain and getattr(home, "shape", None) == (3,) and points.shape[1] == 2
 
 
 def eliminated_by(order: Order | None, home: Home) -> Order | Reference | None:

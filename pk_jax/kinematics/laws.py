@@ -11,7 +11,7 @@ from jax import lax
 
 from pk_jax.geometry.poses import difference, retract, tangent_size, tangent_zero
 from pk_jax.geometry.spread import evenly
-from pk_jax.kinematics.closure import is_closed, joint_scale, pose_scale
+from pk_jax.kinematics.closure import INCONSISTENT_ABOVE, is_closed, joint_scale, pose_scale
 from pk_jax.kinematics.entrywise import entrywise
 from pk_jax.kinematics.forward import forward_kinematics
 from pk_jax.kinematics.inverse import inverse_kinematics
@@ -124,6 +124,7 @@ def _laws(mech: Mechanism):
         "a batch equals a loop: forward kinematics": exact,
         "the closed-form modes contain the pose": 1e2 * exact,
         "every closed-form mode closes the loops": 1e2 * exact,
+        "every closed-form mode closes redundant loops": 10 * INCONSISTENT_ABOVE,
         "linearize gives dF/dx of the residual": exact,
         "entry by entry: the same A": exact,
         "A against central differences": differences,
@@ -203,7 +204,8 @@ def _measure(mech: Mechanism):
         yield "the closed-form modes contain the pose", jnp.max(jnp.min(jnp.where(is_real, gaps, jnp.inf), 1))
         assembled = jax.vmap(lambda xs, q: jax.vmap(lambda x: mech.residual(x, q))(xs))(modes, joints)
         off = jnp.where(is_real[..., None], jnp.abs(assembled) / size[:, 0], 0)
-        yield "every closed-form mode closes the loops", jnp.max(off)
+        loops = "the loops" if a.shape[0] == n else "redundant loops"
+        yield f"every closed-form mode closes {loops}", jnp.max(off)
 
     zero = tangent_zero(pose)
     plain = jax.jacfwd(lambda twist: mech.residual(retract(pose, twist), q))(zero)

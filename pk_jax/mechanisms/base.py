@@ -112,6 +112,13 @@ class Mechanism(abc.ABC):
     def margins(self, pose: Any, joints: jax.Array) -> dict[str, jax.Array]:
         """Named, dimensionless distances to the limits, >= 0 inside; {} where none are known."""
 
+    def default_branch(self) -> jax.Array | None:
+        """The working mode, a vector of signs, that `inverse` takes where none is given. -> (s,)
+
+        None: the closed form has a single mode.
+        """
+        return None
+
     @abc.abstractmethod
     def skeleton(self, pose: Any, joints: jax.Array) -> Skeleton:
         """What to draw."""

@@ -9,11 +9,14 @@ import numpy as np
 
 from pk_jax.mechanisms.base import Mechanism
 from pk_jax.mechanisms.five_bar import FiveBar
+from pk_jax.mechanisms.planar_rpr import PlanarRPR
+from pk_jax.mechanisms.planar_rrr import PlanarRRR
+from pk_jax.mechanisms.six_link import SixLink
 from pk_jax.mechanisms.stewart import Stewart
 from pk_jax.mechanisms.two_rpr import TwoRPR
 
 _NAM = "Nam, Lee and Park 2006, Trans. KSME A 30(11)"
-
+_EXAMPLE = "example geometry (the paper prints none) of the screw paper's"
 
 _INCH, _MM = 0.0254, 1e-3
 
@@ -58,6 +61,22 @@ def _calibration_nominal() -> Stewart:
     return Stewart(base=mirrored(base), platform=mirrored(platform))
 
 
+def _sauer_3_rpr() -> PlanarRPR:
+    return PlanarRPR(base=[[0, 0], [5, 0], [0, 6]], platform=[[0, 0], [3, 0], [3, 3]])
+
+
+def _arte_3_rpr() -> PlanarRPR:
+    return PlanarRPR(
+        base=[[0, 0], [2.5, 0], [1.25, 2.5]], platform=[[0, 0], [0.5, 0], [0.25, 0.25 * np.sqrt(3)]]
+    )
+
+
+def _regular_rrr(arms: int) -> PlanarRRR:
+    turns = np.pi / 2 + 2 * np.pi / arms * (np.arange(arms) + (0.5 if arms % 2 == 0 else 0.0))
+    ring = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    return PlanarRRR(base=0.5 * ring, platform=0.15 * ring, proximal=0.3, distal=0.3)
+
+
 class Entry(NamedTuple):
     """A design by name. `make` builds it, so that reading the catalogue creates no array."""
 
@@ -100,6 +119,19 @@ CATALOGUE: dict[str, Entry] = {
         "hexapod machine tool, nominal geometry of the 42-parameter calibration benchmark "
         "(Masory, Wang and Zhuang)",
     ),
+    "5-link": Entry(
+        lambda: FiveBar(half_base=0.1, proximal=0.2, distal=0.25), f"{_EXAMPLE} 5-link; lengths in m"
+    ),
+    "3-rrr": Entry(lambda: _regular_rrr(3), f"{_EXAMPLE} 3-RRR; lengths in m"),
+    "4-rrr": Entry(lambda: _regular_rrr(4), f"{_EXAMPLE} redundant 4-RRR; lengths in m"),
+    "6-link": Entry(
+        lambda: SixLink(base=[[-0.2, 0], [0.2, 0]], platform=[[-0.1, 0], [0.1, 0]], proximal=0.3, distal=0.3),
+        f"{_EXAMPLE} redundant 6-link; lengths in m",
+    ),
+    "sauer-3-rpr": Entry(
+        _sauer_3_rpr, "planar Stewart platform of Sauer, Numerical Analysis, Reality Check 1; no unit"
+    ),
+    "arte-3-rpr": Entry(_arte_3_rpr, "3-RPR of the ARTE toolbox (github.com/4rtur1t0/ARTE); lengths in m"),
 }
 
 

@@ -8,7 +8,7 @@ from jax import lax
 
 from pk_jax import checks
 from pk_jax.geometry import safe
-from pk_jax.geometry.planar import cross, direction, quarter_turn
+from pk_jax.geometry.planar import arm_angles, cross, direction, quarter_turn
 from pk_jax.mechanisms.base import LegMechanism, Skeleton
 
 ELBOWS_OUT = (1.0, -1.0)  # eq. (6): "+" for leg 1, "-" for leg 2
@@ -17,9 +17,9 @@ ELBOWS_OUT = (1.0, -1.0)  # eq. (6): "+" for leg 1, "-" for leg 2
 class FiveBar(LegMechanism):
     """Two angles drive a point (x, y). Leg 1 stands at (+half_base, 0), leg 2 at (-half_base, 0).
 
-    Fields, all > 0 and in one unit of length: half_base R (), proximal la () the driven links, distal
-    lb () the links that meet, reach (2,) the least and greatest distance from a base joint to the
-    end point that may be used (default: |lb - la| and la + lb, all that the links reach).
+    Fields, all > 0 and in one unit of length: half_base R () (0: a coaxial five-bar), proximal la () the
+    driven links, distal lb () the links that meet, reach (2,) the least and greatest distance from a base
+    joint to the end point that may be used (default: |lb - la| and la + lb, all that the links reach).
     Pose (x, y), joints (phi1, phi2), absolute angles of the driven links.
 
     Working mode: branch_i = sign(sin psi_i), psi_i the angle from the proximal to the distal link
@@ -52,8 +52,10 @@ class FiveBar(LegMechanism):
             checks.has_shape("FiveBar.slack", self.slack, ())
 
     def check_values(self) -> None:
-        for name in ("half_base", "proximal", "distal"):
+        for name in ("proximal", "distal"):
             checks.is_positive(f"FiveBar.{name}", getattr(self, name))
+        if not self.half_base >= 0:
+            raise ValueError(f"FiveBar.half_base must be positive, or 0 (coaxial), got {self.half_base:.6g}")
         nearest, farthest = self.limits()
         roundoff = 1e-6 * (self.proximal + self.distal)
         folded, stretched = abs(self.distal - self.proximal), self.proximal + self.distal
@@ -72,6 +74,9 @@ class FiveBar(LegMechanism):
                 "FiveBar.slack must be sqrt(proximal / half_base - 1) or left out, "
                 f"got {self.slack:.6g} with proximal / half_base = {self.proximal / self.half_base:.6g}"
             )
+
+    def default_branch(self) -> jax.Array:
+        return jnp.asarray(ELBOWS_OUT, self.half_base.dtype)
 
     def base(self) -> jax.Array:
         """Where the legs stand. -> (2, 2)"""
@@ -124,7 +129,8 @@ class FiveBar(LegMechanism):
         return pose, self.inverse(pose)
 
     def length(self) -> jax.Array:
-        return self.half_base
+        """R; of a coaxial five-bar the driven link."""
+        return jnp.where(self.half_base > 0, self.half_base, self.proximal)
 
     def margins(self, pose: jax.Array, joints: jax.Array) -> dict[str, jax.Array]:
         nearest, farthest = self.limits()
@@ -142,25 +148,10 @@ class FiveBar(LegMechanism):
     def inverse(self, pose: jax.Array, branch: jax.Array | None = None, *, free=None) -> jax.Array:
         """Driven angles of a pose in one working mode, eqs. (5)-(6) without their half-angle. -> (2,)
 
-        With psi the elbow angle, the leg vector turned back by (la + lb cos psi, lb sin psi) is the
-        direction of the driven link. NaN for a leg that the pose is out of reach of.
+        NaN for a leg that the pose is out of reach of.
         """
-        branch = jnp.asarray(ELBOWS_OUT if branch is None else branch, pose.dtype)
-        la, lb = self.proximal, self.distal
-        leg = pose - self.base()
-        squared = jnp.sum(leg * leg, axis=-1)
-        distance = safe.sqrt(squared)
-        # Heron's factors keep sin(psi) accurate at full stretch and when folded
-        heron = (la + lb - distance) * (la + lb + distance) * (distance - lb + la) * (distance + lb - la)
-        along = (squared + la**2 - lb**2) / 2  # la times the projection of la on the leg
-        across = -branch * safe.sqrt(heron) / 2
-        angle = jnp.arctan2(
-            leg[:, 1] * along + leg[:, 0] * across,
-            leg[:, 0] * along - leg[:, 1] * across,
-        )
-        roundoff = 8 * jnp.finfo(pose.dtype).eps * (la + lb)
-        reachable = (distance <= la + lb + roundoff) & (distance >= jnp.abs(lb - la) - roundoff)
-        return jnp.where(reachable & (distance > 0), angle, jnp.nan)
+        branch = self.default_branch() if branch is None else jnp.asarray(branch, pose.dtype)
+        return arm_angles(pose - self.base(), self.proximal, self.distal, branch)
 
     def forward(self, joints: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Both assembly modes, the end point above the elbows first. -> poses (2, 2), is_real (2,)

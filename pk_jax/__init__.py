@@ -10,6 +10,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pk_jax.analysis.indices import LocalIndices as LocalIndices
     from pk_jax.analysis.indices import local_indices as local_indices
+    from pk_jax.analysis.singularity import Singularity as Singularity
+    from pk_jax.analysis.singularity import SingularityKind as SingularityKind
+    from pk_jax.analysis.singularity import classify_singularity as classify_singularity
+    from pk_jax.analysis.singularity import singularity_distance as singularity_distance
     from pk_jax.analysis.workspace import IndexErrors as IndexErrors
     from pk_jax.analysis.workspace import WorkspaceIndices as WorkspaceIndices
     from pk_jax.analysis.workspace import workspace_indices as workspace_indices
@@ -59,6 +63,12 @@ _NAMES = {
     "pk_jax.analysis.indices": (
         "LocalIndices",
         "local_indices",
+    ),
+    "pk_jax.analysis.singularity": (
+        "Singularity",
+        "SingularityKind",
+        "classify_singularity",
+        "singularity_distance",
     ),
     "pk_jax.analysis.workspace": (
         "IndexErrors",

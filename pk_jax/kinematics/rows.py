@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -19,13 +17,11 @@ from pk_jax import checks
 from pk_jax.kinematics.batching import home_shapes
 from pk_jax.kinematics.compiled import FULL, Options, compiled
 from pk_jax.kinematics.elimination import Order
+from pk_jax.kinematics.in_blocks import aligned, block_size, in_blocks, padded, size_of
 from pk_jax.kinematics.lane_newton import Attempt, Home, at_home, attempt, home_from, order_of
 from pk_jax.kinematics.lanes import items_of, rebuilt, split, split_rows
 from pk_jax.mechanisms.base import Mechanism
 
-BLOCK = 8192  # rows of one call at most; on an accelerator they are the lanes, all at once
-ON_ACCELERATOR = 1 << 16
-WORTH_A_THREAD = 4096  # rows
 ORDERS = 4  # orders of pivots that a family of mechanisms is compiled for
 
 
@@ -89,13 +85,13 @@ def solve(
     ready = prepared(mech)
     count, dtype = joints.shape[0], joints.dtype
     start = "home" if guess is None else "one" if one_guess else "rows"
-    block = BLOCK if jax.default_backend() == "cpu" else ON_ACCELERATOR
+    block = block_size()
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in ready.leaves)
     run_block = program(ready.tree, shapes, ready.order, start, block, joints.shape[1], dtype, options)
     pose_leaves, pose_tree = jax.tree.flatten(ready.shapes[0])
-    poses = [_aligned((count, *leaf.shape), dtype) for leaf in pose_leaves]
+    poses = [aligned((count, *leaf.shape), dtype) for leaf in pose_leaves]
     numbers = [
-        _aligned((count,), np.int32 if name in ("status", "steps") else dtype) for name in Rows._fields[1:]
+        aligned((count,), np.int32 if name in ("status", "steps") else dtype) for name in Rows._fields[1:]
     ]
     cuts = np.cumsum([leaf.size for leaf in pose_leaves])
     if guess is not None:
@@ -104,12 +100,11 @@ def solve(
         ]
         guess = np.concatenate(flat, axis=1)
 
-    def run(first: int) -> None:
-        rows = slice(first, min(first + share, count))
-        size = rows.stop - first
-        given = [jnp.asarray(_padded(joints[rows], block)), _count(size)]
+    def run(first: int, last: int) -> None:
+        rows, size = slice(first, last), last - first
+        given = [jnp.asarray(padded(joints[rows], block)), size_of(size)]
         if guess is not None:
-            given.append(jnp.asarray(guess[0] if one_guess else _padded(guess[rows], block)))
+            given.append(jnp.asarray(guess[0] if one_guess else padded(guess[rows], block)))
         out = np.asarray(run_block([*ready.leaves, *given])[0])  # (chunks, values, lanes)
         out = out[: -(-size // out.shape[2])]
         for pose, begin, end in zip(poses, (0, *cuts), cuts, strict=False):
@@ -118,19 +113,7 @@ def solve(
         for column, number in enumerate(numbers, cuts[-1]):
             number[rows] = out[:, column].reshape(-1)[:size]
 
-    workers = cores() if workers is None else workers
-    blocks = max(-(-count // block), min(workers, -(-count // WORTH_A_THREAD)), 1)
-    share = max(-(-count // blocks), 1)
-    starts = iter(range(0, count, share))
-
-    def drain() -> None:
-        for first in starts:  # each block is taken by one thread
-            run(first)
-
-    helpers = [_threads().submit(drain) for _ in range(min(workers, blocks) - 1)]
-    drain()
-    for helper in helpers:
-        helper.result()
+    in_blocks(run, count, block, workers)
     return Rows(jax.tree.unflatten(pose_tree, poses), *numbers)
 
 
@@ -190,37 +173,3 @@ def program(
 def values_of(found: Attempt, dtype: Any) -> jax.Array:
     """Everything that an attempt says, as one array of lanes. -> (values, lanes)"""
     return jnp.stack([item.astype(dtype) for item in (*items_of(found.pose), *found[1:])])
-
-
-def _aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """An array that JAX takes over without a copy."""
-    size = math.prod(shape) * np.dtype(dtype).itemsize
-    memory = np.empty(size + 64, np.uint8)
-    begin = -memory.ctypes.data % 64
-    return memory[begin : begin + size].view(dtype).reshape(shape)
-
-
-def _padded(rows: np.ndarray, count: int) -> np.ndarray:
-    if len(rows) == count:
-        return rows
-    full = np.empty((count, *rows.shape[1:]), rows.dtype)
-    full[: len(rows)], full[len(rows) :] = rows, rows[-1]
-    return full
-
-
-@cache
-def cores() -> int:
-    """How many blocks are solved at a time."""
-    if jax.default_backend() != "cpu":
-        return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(cores(), thread_name_prefix="pk_jax")
-
-
-@lru_cache(maxsize=1024)
-def _count(size: int) -> jax.Array:
-    return jnp.asarray(np.int32(size))

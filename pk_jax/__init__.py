@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pk_jax.analysis.indices import LocalIndices as LocalIndices
     from pk_jax.analysis.indices import local_indices as local_indices
+    from pk_jax.analysis.loci import LocusCurve as LocusCurve
+    from pk_jax.analysis.loci import SingularityLocus as SingularityLocus
+    from pk_jax.analysis.loci import singularity_locus as singularity_locus
     from pk_jax.analysis.singularity import Singularity as Singularity
     from pk_jax.analysis.singularity import SingularityKind as SingularityKind
     from pk_jax.analysis.singularity import classify_singularity as classify_singularity
@@ -63,6 +66,11 @@ _NAMES = {
     "pk_jax.analysis.indices": (
         "LocalIndices",
         "local_indices",
+    ),
+    "pk_jax.analysis.loci": (
+        "LocusCurve",
+        "SingularityLocus",
+        "singularity_locus",
     ),
     "pk_jax.analysis.singularity": (
         "Singularity",

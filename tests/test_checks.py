@@ -50,7 +50,7 @@ def refused(build, *words, **fields):
 @pytest.mark.parametrize("bad", NOT_A_LENGTH.values(), ids=NOT_A_LENGTH.keys())
 @each_field
 def test_every_length_is_checked(mechanism, good, field, bad):
-    if (mechanism, field, bad) == (pk.FiveBar, "half_base", 0.0):
+    if mechanism is pk.FiveBar and field == "half_base" and bad is NOT_A_LENGTH["zero"]:
         assert float(mechanism(**{**good, field: bad}).length()) == good["proximal"]  # a coaxial five-bar
         return
     refused(mechanism, f"{mechanism.__name__}.{field} ", **{**good, field: bad})

@@ -32,6 +32,21 @@ MECHANISMS = {
     ),
     "FiveBar": pk.FiveBar(half_base=0.1, proximal=0.139, distal=0.269),
     "FiveBar full": pk.FiveBar(half_base=1.0, proximal=1.39, distal=2.69, reach=(2.08, 4.08)),
+    "FiveBar coaxial": pk.FiveBar(half_base=0.0, proximal=0.23, distal=0.35),
+    "PlanarRRR": pk.PlanarRRR(
+        base=[[0.1, 1 / 3], [-0.3, -0.2], [0.4, -0.2]],
+        platform=[[0.0, 0.1], [-0.1, -0.05], [0.1, -0.05]],
+        proximal=[0.3, 0.31, 0.29],
+        distal=0.3,
+    ),
+    "PlanarRPR": pk.PlanarRPR(
+        base=[[0.0, 0.0], [2.5, 0.1], [1.25, 2.5]],
+        platform=[[0.0, 0.0], [0.5, 0.0], [0.25, 0.4]],
+        stroke=(0.1, 3.0),
+    ),
+    "SixLink": pk.SixLink(
+        base=[[-0.2, 0.0], [0.2, 0.0]], platform=[[-0.1, 0.0], [0.1, 0.0]], proximal=0.3, distal=(0.3, 1 / 3)
+    ),
     "TwoRPR": pk.TwoRPR(half_base=1 / 3, l_min=0.1 + 0.2, l_max=1.0),
 }
 # the same five-bar in every unit
@@ -127,11 +142,16 @@ def test_only_lengths_are_scaled(tmp_path, write):
 def test_every_field_of_every_family_is_known_to_be_a_length_or_not():
     """A new field must be looked at here, and in ANGLES, DIRECTIONS or NOT_IN_FILES if it is no length."""
     not_lengths = {*mechanism_file.ANGLES, *mechanism_file.DIRECTIONS, *mechanism_file.NOT_IN_FILES}
-    for family, lengths in {
+    known = {
         "Stewart": {"base", "platform", "stroke"},
+        "PlanarRRR": {"base", "platform", "proximal", "distal"},
+        "PlanarRPR": {"base", "platform", "stroke"},
+        "SixLink": {"base", "platform", "proximal", "distal"},
         "FiveBar": {"half_base", "proximal", "distal", "reach"},
         "TwoRPR": {"half_base", "l_min", "l_max"},
-    }.items():
+    }
+    assert set(known) == set(mechanism_file.FAMILIES)
+    for family, lengths in known.items():
         names = {f.name for f in dataclasses.fields(mechanism_file.FAMILIES[family])}
         assert names - not_lengths == lengths
 
@@ -215,7 +235,10 @@ WRONG = {
         'family = "FiveBar"\nunit = "m"\nhalf_base = 1\nproximal = 2\ndistal = 3\nslack = 1',
         "unknown key 'slack'",
     ),
-    "no family": (REST, 'missing key \'family\', one of "Stewart", "FiveBar", "TwoRPR"$'),
+    "no family": (
+        REST,
+        'missing key \'family\', one of "Stewart", "PlanarRRR", "PlanarRPR", "SixLink", "FiveBar", "TwoRPR"$',
+    ),
     "empty": ("", "missing key 'family'"),
     "no unit": (
         'family = "TwoRPR"\n' + REST,
@@ -382,7 +405,9 @@ def test_only_what_can_be_loaded_is_saved(tmp_path):
             save_mechanism(mech, path, **kwargs)
         assert str(told.value).startswith(f"{path}: ") and "\n" not in str(told.value)
 
-    of_the_house = "only a mechanism of the house can be saved, Stewart, FiveBar, TwoRPR, got "
+    of_the_house = "only a mechanism of the house can be saved, {}, got ".format(
+        "Stewart, PlanarRRR, PlanarRPR, SixLink, FiveBar, TwoRPR"
+    )
     refused(Delta(base_radius=0.2, platform_radius=0.1, arm=0.3, rod=0.5), of_the_house + "Delta$")
     refused(Mine(**fields(good)), of_the_house + "Mine$")
     refused(None, of_the_house + "NoneType$")

@@ -64,13 +64,13 @@ def classify_singularity(
     tol:           sigma below this is singular; 1e-6 by default, because a reach limit itself is only
                    known to the root of roundoff. A larger one selects a band around singularities.
 
-    Every value is the sine of an angle between the motions that exist and those that a singularity would have;
-    at a CONFIGURATION_SPACE singularity they refer to the larger set of first-order motions. NaN
-    where the status is not OK: BAD_INPUT for what is not finite, INCONSISTENT for open loops.
+    Every value is the sine of an angle between motions that exist and those that a singularity would have;
+    at a CONFIGURATION_SPACE singularity of the larger set of first-order motions. NaN where the
+    status is not OK: BAD_INPUT for what is not finite, INCONSISTENT for open loops.
     The sigmas are differentiable where exactly one singular value is least.
 
-    Source: Gosselin and Angeles 1990, IEEE Trans. Robotics and Automation 6(3), for the three types; Zlatanov,
-    Fenton and Benhabib 1994 for the configuration space.
+    Source: Gosselin and Angeles 1990, IEEE Trans. Robotics and Automation 6(3), for the three
+    types; Zlatanov, Fenton and Benhabib 1994 for the configuration space.
     """
     require_mechanism("classify_singularity", mech)
     rows, are_batched = configurations(mech, pose, joints)
@@ -115,8 +115,9 @@ def _length(mech: Mechanism, length: Any) -> jax.Array:
 def scaled_rows(
     mech: Mechanism, pose: Any, joints: jax.Array, length: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """A (c, n) and B (c, m) with lengths over `length` and each row of [A B] of unit norm."""
-    a, b = pose_jacobian(mech, pose, joints), joint_jacobian(mech, pose, joints)
+    """A (c, n) and B (c, m) of the rows that carry force: lengths over `length`, [A B] with unit rows."""
+    rows = slice(mech.actuated_rows)  # sensors lock nothing
+    a, b = pose_jacobian(mech, pose, joints)[rows], joint_jacobian(mech, pose, joints)[rows]
     a = a * length ** units(pose_units(pose, mech.pose_units), a.dtype)
     b = b * length ** units(mech.joint_units or (1,) * b.shape[1], b.dtype)
     squared = jnp.sum(a * a, axis=1, keepdims=True) + jnp.sum(b * b, axis=1, keepdims=True)

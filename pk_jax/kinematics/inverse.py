@@ -83,7 +83,7 @@ def branch_shape(mech: Mechanism) -> jax.ShapeDtypeStruct:
 
 
 def working_modes(mech: Mechanism) -> np.ndarray:
-    """Every working mode of the closed form, the default one first; one row of no signs for one mode. -> (2^s, s)"""
+    """Every working mode, the default one first; one row of no signs where there is one. -> (2^s, s)"""
     shape = jax.eval_shape(lambda mech: mech.default_branch(), mech)
     if shape is None:
         return np.zeros((1, 0))

@@ -50,7 +50,7 @@ def lane_map(function: Function, mech: Any, rows: tuple) -> np.ndarray:
 def _program(
     function: Function, mech_tree: Any, shapes: tuple, tree: Any, row_shapes: tuple, block: int
 ) -> tuple[Callable, jax.ShapeDtypeStruct]:
-    """The compiled block, (mechanism, rows, number of rows) -> (chunks, values, lanes), and one of its chunks."""
+    """The compiled block, (mechanism, rows, number of rows) -> (chunks, values, lanes); and one chunk."""
     mech = jax.tree.unflatten(mech_tree, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
     rows = jax.tree.unflatten(
         tree, [jax.ShapeDtypeStruct((block, *shape), dtype) for shape, dtype in row_shapes]

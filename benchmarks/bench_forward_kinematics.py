@@ -257,7 +257,9 @@ def naive(robot: pk.Mechanism, joints: jax.Array):
             pose, _, k = state
             moved = lambda twist: robot.residual(retract(pose, twist), q)
             zero = jnp.zeros(size)
-            twist = -jnp.linalg.solve(jax.jacfwd(moved)(zero), moved(zero))
+            jacobian, value = jax.jacfwd(moved)(zero), moved(zero)
+            is_square = value.size == size
+            twist = jnp.linalg.solve(jacobian, -value) if is_square else jnp.linalg.lstsq(jacobian, -value)[0]
             return retract(pose, twist), jnp.max(jnp.abs(twist)), k + 1
 
         return lax.while_loop(lambda s: (s[1] > 1e-12) & (s[2] < 20), step, (home, jnp.inf, 0))[0]

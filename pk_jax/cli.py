@@ -129,9 +129,7 @@ def _jacobian(options: argparse.Namespace) -> int:
 
 
 def _draw(options: argparse.Namespace) -> int:
-    kind = Path(options.out).suffix.lower().removeprefix(".")
-    if kind not in ("png", "svg", "pdf"):
-        raise ValueError(f"-o must end in .png, .svg or .pdf, got {options.out!r}")
+    kind = _image_kind(options.out)
     _begin()
     from pk_jax.files.atomic import output_file
     from pk_jax.files.named import named_mechanism
@@ -151,6 +149,58 @@ def _draw(options: argparse.Namespace) -> int:
     return 0
 
 
+def _singularity(options: argparse.Namespace) -> int:
+    kind = _image_kind(options.out) if options.out else None
+    progress = _begin()
+    from pk_jax.files import singular
+    from pk_jax.files.atomic import output_file
+    from pk_jax.files.named import named_mechanism
+    from pk_jax.files.shown import as_json, configuration_at
+    from pk_jax.files.stream import pose_of
+    from pk_jax.viz import singularity as viz
+
+    named = named_mechanism(options.mechanism, options.unit)
+    with contextlib.ExitStack() as stack:
+        image = stack.enter_context(output_file(options.out)) if options.out else None
+        if options.pose is not None:
+            found = singular.classified(named, options.pose, options.tol)
+            print(as_json(found) if options.json else singular.classified_text(found))
+            if image:
+                pose, joints, _ = configuration_at(named, options.pose)
+                axes = viz.draw_screws(named.mechanism, pose, joints)
+                axes.set_title(f"{Path(named.name).name}: {found['kind']}")
+                axes.figure.savefig(image, format=kind, dpi=150)
+            return 0
+        table = stack.enter_context(output_file(options.csv)) if options.csv else None
+        at = None if options.at is None else pose_of(named, options.at)
+        locus = singular.locus_of(
+            named,
+            options.axes,
+            at,
+            options.range,
+            options.mode,
+            options.kind or ("I", "II"),
+            options.nodes,
+            progress,
+        )
+        progress.close()
+        print(singular.locus_text(named, locus))
+        if table:
+            table.write(singular.locus_rows(named, locus).encode())
+        if image:
+            unit = named.unit if named.path and named.unit != "1" else ""
+            figure = viz.draw_locus(named.mechanism, locus, unit=unit, scale=named.metres)
+            figure.savefig(image, format=kind, dpi=150)
+    return 0
+
+
+def _image_kind(path: str) -> str:
+    kind = Path(path).suffix.lower().removeprefix(".")
+    if kind not in ("png", "svg", "pdf"):
+        raise ValueError(f"-o must end in .png, .svg or .pdf, got {path!r}")
+    return kind
+
+
 def _show(options: argparse.Namespace) -> int:
     _begin()
     from pk_jax.files.named import named_mechanism
@@ -162,8 +212,15 @@ def _show(options: argparse.Namespace) -> int:
 
 def _reproduce(options: argparse.Namespace) -> int:
     progress = _begin()
+    if options.paper == "planar-screws":
+        from pk_jax.papers.planar_screws_report import report_into
+
+        is_right = report_into(options.out or "runs/planar-screws", say=progress.say, show=print)
+        progress.close()
+        return 0 if is_right else NUMERICAL
     from pk_jax.papers.nam2006_report import as_text, reproduce_into
 
+    options.out = options.out or "runs/nam2006"
     found = reproduce_into(options.out, report=progress, say=progress.say)
     progress.close()
     print(as_text(found))
@@ -272,10 +329,10 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _with_pose_joined(arguments: Sequence[str]) -> list[str]:
-    """`--pose -1,2` as `--pose=-1,2`, which argparse would take for an option."""
+    """`--pose -1,2` as `--pose=-1,2`: argparse would take the value for an option."""
     rest, joined = iter(arguments), []
     for each in rest:
-        value = next(rest, None) if each == "--pose" else None
+        value = next(rest, None) if each in ("--pose", "--at", "--mode", "--range") else None
         joined.append(each if value is None else f"{each}={value}")
     return joined
 
@@ -292,9 +349,16 @@ def _parser() -> argparse.ArgumentParser:
         return sub
 
     sub = command(
-        "reproduce", _reproduce, "Nam, Lee and Park 2006: both tables, Figs. 1-7, and better optima"
+        "reproduce", _reproduce, "a paper's tables and figures: Nam, Lee and Park 2006, with better optima"
     )
-    sub.add_argument("--out", default="runs/nam2006", metavar="DIR", help="run folder (default: %(default)s)")
+    sub.add_argument(
+        "paper",
+        nargs="?",
+        default="nam2006",
+        choices=("nam2006", "planar-screws"),
+        help="default: %(default)s; planar-screws: singular poses and loci of the 5-link, k-RRR and 6-link",
+    )
+    sub.add_argument("--out", metavar="DIR", help="run folder (default: runs/nam2006, runs/planar-screws)")
 
     sub = command("workspace", _workspace, "GII, GRI and SUI of a 2-RPR or 2-RRR")
     sub.add_argument("mechanism", help="2-rpr, 2-rrr, a catalogue entry (see: pk-jax list) or a TOML file")
@@ -342,6 +406,29 @@ def _parser() -> argparse.ArgumentParser:
         sub.add_argument("--unit", help=unit)
         if sub is not shown:
             sub.add_argument("--pose", metavar="X,Y,...", help="as a row of ik (default: home)")
+
+    sub = command("singularity", _singularity, "where a mechanism is singular, and how far from it a pose is")
+    sub.add_argument("mechanism", help=named)
+    sub.add_argument("--unit", help=unit)
+    sub.add_argument("--pose", metavar="X,Y,...", help="classify this pose instead of seeking the loci")
+    sub.add_argument("--tol", type=float, default=1e-6, help="sigma below this is singular (default: 1e-6)")
+    sub.add_argument("--json", action="store_true", help="with --pose: machine-readable")
+    sub.add_argument(
+        "--axes",
+        metavar="A,B",
+        help="coordinates of the map, of x, y, z, rx, ry, rz, phi (default: first two)",
+    )
+    sub.add_argument("--at", metavar="X,Y,...", help="pose with the other coordinates (default: home)")
+    sub.add_argument(
+        "--range", action="append", default=[], metavar="A=LO:HI", help="range of an axis, angles in rad"
+    )
+    sub.add_argument("--mode", metavar="+-+", help="one working mode (default: all)")
+    sub.add_argument("--kind", action="append", choices=("I", "II"), help="only this type (default: both)")
+    sub.add_argument(
+        "--nodes", type=int, help="of the grid, along each axis (default: 101; 25 for three axes)"
+    )
+    sub.add_argument("-o", "--out", metavar="FILE", help="the map with its loci, a .png, .svg or .pdf")
+    sub.add_argument("--csv", metavar="FILE", help="every point of the loci")
 
     command("list", _list, "the catalogue of published designs")
     return parser

@@ -36,7 +36,7 @@ def coordinate_names(mech: Mechanism) -> tuple[str, ...]:
         return ("x", "y", "phi")
     if all(unit) and len(unit) <= 3:
         return SPACE[: len(unit)]
-    return tuple(f"x{i}" for i in range(1, len(unit) + 1))
+    return tuple(f"p{i}" for i in range(1, len(unit) + 1))
 
 
 class Slice(NamedTuple):

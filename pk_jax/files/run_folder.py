@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import io
 import json
 import os
 from collections.abc import Iterator
@@ -27,6 +28,12 @@ class RunFolder:
 
     def write_text(self, name: str, content: str) -> Path:
         return self.write(name, content.encode())
+
+    def write_figure(self, name: str, figure: Any) -> Path:
+        """A matplotlib figure as PNG."""
+        image = io.BytesIO()
+        figure.savefig(image, format="png", dpi=150, metadata={"Software": None})
+        return self.write(name, image.getvalue())
 
     def write_json(self, name: str, content: Any) -> Path:
         """Strict JSON: NaN and infinity are refused, keys keep their order."""

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from pk_jax.analysis.slices import coordinate_names
 from pk_jax.files.atomic import output_file
 from pk_jax.files.columns import Column, Layout
 from pk_jax.files.named import Named
@@ -132,8 +133,7 @@ def _position(named: Named) -> Layout:
     if isinstance(pose, SE3):
         return tuple(Column(name, "length") for name in "xyz")
     units = pose_units(pose, named.mechanism.pose_units)
-    names = {2: ("x", "y"), 3: ("x", "y", "z" if all(units) else "phi")}.get(len(units))
-    names = names or [f"p{i}" for i in range(1, len(units) + 1)]
+    names = coordinate_names(named.mechanism)
     return tuple(Column(name, _KINDS[u]) for name, u in zip(names, units, strict=True))
 
 

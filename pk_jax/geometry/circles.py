@@ -28,19 +28,17 @@ def platforms_on_circles(
     given = platform, centres, radii
     known = lax.stop_gradient(given)
     poses = _candidates(*known)
-    anywhere = jnp.ones(poses.shape[0], bool)
     for _ in range(POLISHED):
-        poses = _newton(poses, *known, anywhere)
+        poses = _newton(poses, *known, jnp.ones(poses.shape[0], bool))
 
-    size = _size(*known)
+    size, eps = _size(*known), jnp.finfo(poses.dtype).eps
     turns = jnp.arctan2(jnp.sin(poses[:, 2]), jnp.cos(poses[:, 2]))
     poses = poses.at[:, 2].set(turns)
-    eps = jnp.finfo(poses.dtype).eps
     off = jnp.max(jnp.abs(_equations(poses, *known)), axis=1) / size**2
-    is_real = off < jnp.maximum(CLOSED_TO, 1e3 * eps)  # NaN compares False
+    is_real = off < jnp.maximum(CLOSED_TO, 64 * eps)  # NaN compares False
     gaps = jnp.abs(poses[:, None] - poses)
     turned = jnp.abs(2 * jnp.sin(gaps[..., 2] / 2))
-    is_same = jnp.maximum(jnp.max(gaps[..., :2], axis=-1) / size, turned) < jnp.maximum(APART, 1e2 * eps)
+    is_same = jnp.maximum(jnp.max(gaps[..., :2], axis=-1) / size, turned) < jnp.maximum(APART, 1e3 * eps)
     is_real = is_real & ~jnp.any(jnp.tril(is_same & is_real, -1), axis=1)
     order = jnp.argsort(jnp.where(is_real, turns, jnp.inf))[:MOST]
     poses, is_real = poses[order], is_real[order]
@@ -66,14 +64,14 @@ def _candidates(platform: jax.Array, centres: jax.Array, radii: jax.Array) -> ja
     b = d * g.conj()
     w = jnp.stack([b.conj() / 2, a + 0j, b / 2], axis=1)  # powers -1, 0, 1 of z
     u = jnp.stack([-g, d], axis=1)  # powers 0, 1
-    v = jnp.convolve(w[0], u[1]) - jnp.convolve(w[1], u[0])  # i Y D, powers -1 .. 2
+    v = _product(w[0], u[1]) - _product(w[1], u[0])  # i Y D, powers -1 .. 2
     turn = (d[0] * g[1].conj() - d[1] * g[0].conj()) / 2j
     across = jnp.imag(d[0].conj() * d[1] + g[0].conj() * g[1])
     cross = jnp.stack([turn.conj(), across + 0j, turn])  # D = u_1 x u_2
-    f = jnp.convolve(v, v[::-1].conj()) - r[0] ** 2 * jnp.pad(jnp.convolve(cross, cross), 1)  # -3 .. 3
+    f = _product(v, v[::-1].conj()) - r[0] ** 2 * jnp.pad(_product(cross, cross), 1)  # -3 .. 3
 
     powers = jnp.arange(-3, 4)
-    angles = jnp.arange(SAMPLES) * (2 * np.pi / SAMPLES)
+    angles = jnp.arange(SAMPLES, dtype=r.dtype) * (2 * np.pi / SAMPLES)
     values = jnp.real(jnp.exp(1j * angles[:, None] * powers) @ f)
     opposite = angles[jnp.argmax(jnp.abs(values))] + np.pi
     polynomial = jnp.real(f * jnp.exp(1j * opposite * powers) @ jnp.asarray(_HALF_ANGLE, f.dtype))
@@ -92,6 +90,12 @@ def _candidates(platform: jax.Array, centres: jax.Array, radii: jax.Array) -> ja
     y = longer * (along + 1j * rise * height)
     origin = size * (middles[0] + y - jnp.exp(1j * phi) * points[0])
     return jnp.stack([origin.real, origin.imag, phi], axis=1)
+
+
+def _product(first: jax.Array, second: jax.Array) -> jax.Array:
+    """Coefficients of the product of two polynomials."""
+    shifted = [jnp.pad(a * second, (i, len(first) - 1 - i)) for i, a in enumerate(first)]
+    return sum(shifted[1:], shifted[0])
 
 
 def _half_angle_powers() -> np.ndarray:
@@ -126,8 +130,12 @@ def _newton(
 
     def moved(pose, is_wanted):
         equations = lambda pose: _equations(pose[None], platform, centres, radii)[0]
-        jacobian = jnp.where(is_wanted, jax.jacfwd(equations)(pose), jnp.eye(3, dtype=pose.dtype))
-        step = jnp.linalg.solve(jacobian, equations(pose))
+        value, (a, b, c) = (
+            equations(pose),
+            jnp.where(is_wanted, jax.jacfwd(equations)(pose), jnp.eye(3, dtype=pose.dtype)),
+        )
+        crosses = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])  # Cramer's rule
+        step = value @ crosses / jnp.dot(a, crosses[0])
         return pose - jnp.where(jnp.isfinite(step), step, 0)
 
     return jax.vmap(moved)(poses, is_wanted)

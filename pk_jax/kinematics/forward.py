@@ -179,14 +179,19 @@ def _persist(
     status = lane_newton.verdict(judged, solution.is_stationary, side, is_square=is_square)
     limit_hit = (status == Status.STALLED) & ~solution.is_stationary
     status = jnp.where(limit_hit, Status.STEP_LIMIT, status)
-    if hasattr(mech, "forward"):
-        is_unreal = ~jnp.any(mech.forward(q)[1])
-        is_unsolved = (status == Status.STALLED) | (status == Status.STEP_LIMIT)
-        status = jnp.where(is_unsolved & is_unreal, Status.UNREACHABLE, status)
+    if hasattr(mech, "forward") and is_square:
+        is_unsolved = ((status == Status.STALLED) | (status == Status.STEP_LIMIT)) & is_lost
+        status = jnp.where(_is_unreal(mech, q, is_unsolved), Status.UNREACHABLE, status)
     status = jnp.where(is_given, status, Status.BAD_INPUT)
     steps = found.steps + solution.steps
     again = _answer(solution.point, status, judged.residual, steps, judged.sigma_min, judged.sign * home.sign)
     return where((found.status == Status.STALLED), again, found)
+
+
+def _is_unreal(mech: Mechanism, joints: jax.Array, is_asked: jax.Array) -> jax.Array:
+    """Whether the closed form has no real pose; a batch in which no row asks costs nothing. -> ()"""
+    ask = lambda state: (jnp.asarray(False), ~jnp.any(mech.forward(joints)[1]))
+    return lax.while_loop(lambda state: state[0], ask, (is_asked, jnp.asarray(False)))[1]
 
 
 def _answer(

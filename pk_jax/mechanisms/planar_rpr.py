@@ -53,7 +53,7 @@ class PlanarRPR(LegMechanism):
         planar_platform.check_home("PlanarRPR", _best_home(self)[1], "stroke")
 
     def limits(self) -> tuple[jax.Array, jax.Array]:
-        """Least and greatest length of each leg; without a stroke, for the search for a home. -> (k,), (k,)"""
+        """Least and greatest length of each leg; without a stroke, where a home is sought. -> (k,), (k,)"""
         each = jnp.zeros(self.base.shape[0], self.base.dtype)
         if self.stroke is None:
             size = planar_platform.platform_radius(self.base) + self.length()

@@ -16,7 +16,7 @@ import numpy as np
 from pk_jax.analysis.workspace import workspace_indices
 from pk_jax.design.objective import composite_index, index_vector
 from pk_jax.design.variables import design_space
-from pk_jax.files.run_folder import RunFolder, run_folder
+from pk_jax.files.run_folder import run_folder
 from pk_jax.papers.nam2006 import Cell, Reproduction, reproduce
 from pk_jax.papers.nam2006_printed import MISPRINTS, TABLES
 
@@ -35,7 +35,7 @@ def reproduce_into(path: str | os.PathLike, *, report: Any = None, say: SAY = la
         figures = dict(_figures(found))
         folder.write_text("tables.csv", as_csv(found.cells))
         for name, figure in figures.items():
-            _write_figure(folder, name, figure)
+            folder.write_figure(name, figure)
         folder.write_json("tables.json", as_json(found))
     return found
 
@@ -169,9 +169,3 @@ def _cpi(name: str, vectors: np.ndarray, optimum) -> np.ndarray:
     index = lambda vector: index_vector(workspace_indices(space.mechanism(vector), nodes=nodes))
     indices = jax.jit(jax.vmap(index))(jnp.asarray(vectors))
     return np.asarray(composite_index(indices, optimum.bounds))
-
-
-def _write_figure(folder: RunFolder, name: str, figure: Any) -> None:
-    image = io.BytesIO()
-    figure.savefig(image, format="png", dpi=150, metadata={"Software": None})
-    folder.write(name, image.getvalue())

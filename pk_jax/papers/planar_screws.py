@@ -40,6 +40,8 @@ def geometric_screws(mech: Mechanism, pose: jax.Array, joints: jax.Array) -> Geo
 
     Source: eqs. (21)-(24), (29)-(31), (34) and Figs. 4, 5, 8, 11. ValueError for another mechanism.
     """
+    if not isinstance(mech, FiveBar | PlanarRRR | PlanarRPR | SixLink):
+        raise ValueError(f"geometric_screws takes one of the planar robots, got {type(mech).__name__}")
     pose, joints = jnp.asarray(pose), jnp.asarray(joints)
     match mech:
         case FiveBar():  # BP and CP
@@ -53,8 +55,6 @@ def geometric_screws(mech: Mechanism, pose: jax.Array, joints: jax.Array) -> Geo
             driven = jnp.stack([mech.base, elbows], axis=1).reshape(4, 2)
             first = jnp.stack([elbows, mech.base], axis=1).reshape(4, 2)
             second = jnp.repeat(place(pose, mech.platform), 2, axis=0)
-        case _:
-            raise ValueError(f"geometric_screws takes one of the planar robots, got {type(mech).__name__}")
     along = second - first
     u = direction(jnp.arctan2(along[:, 1], along[:, 0]))
     moments = cross(second - pose[:2], u)[:, None]

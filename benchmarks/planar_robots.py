@@ -1,4 +1,4 @@
-"""Planar robots: forward kinematics, a million classifications and a singularity locus, against the usual ways.
+"""Planar robots: forward kinematics, a million classifications and a singularity locus, and the usual ways.
 
     make bench        or        python -m benchmarks.planar_robots [--quick]
 
@@ -80,7 +80,7 @@ def classification(count: int) -> None:
     print(
         f"\nclassify {count:,} poses of the 3-RRR: {1 / ours:,.0f} a second, one call; NumPy loop "
         f"{1 / theirs:,.0f} a second: {theirs / ours:.0f} times\n  greatest difference of the distances "
-        f"{np.abs(mine - sines).max():.0e}, first call {first:.1f} s, peak memory of the process {peak:.2f} GB"
+        f"{np.abs(mine - sines).max():.0e}, first call {first:.1f} s, peak memory {peak:.2f} GB"
     )
 
 
@@ -92,7 +92,7 @@ def robot_of(robot: pk.PlanarRRR) -> tuple[np.ndarray, ...]:
 
 def numpy_sines(robot: tuple[np.ndarray, ...], pose: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """Distances to type I and II of a 3-RRR, by hand: two SVDs of the null space of [A B]. -> (2,)"""
-    base, platform, la, lb, length = robot
+    base, platform, la, _, length = robot
     c, s = np.cos(pose[2]), np.sin(pose[2])
     arm = platform @ np.array([[c, s], [-s, c]])
     link = la * np.stack([np.cos(joints), np.sin(joints)], axis=1)
@@ -107,7 +107,7 @@ def numpy_sines(robot: tuple[np.ndarray, ...], pose: np.ndarray, joints: np.ndar
 
 
 def locus(nodes: int) -> None:
-    """The type II locus of the 3-RRR over x and y, all working modes: points on it, and how exact they are."""
+    """The type II locus of the 3-RRR over x and y, all working modes: its points, and how exact they are."""
     robot = pk.catalogued("3-rrr")
     begin = time.perf_counter()
     found = pk.singularity_locus(robot, kinds="II", nodes=nodes)
@@ -127,8 +127,8 @@ def locus(nodes: int) -> None:
         seconds = time.perf_counter() - begin
         sigma = exactness(robot, vertices)
         print(
-            f"  NumPy determinants and contours, {size}^2: {seconds:.2f} s, {sum(map(len, vertices))} points, "
-            f"sigma median {np.median(sigma):.0e}, largest {sigma.max():.0e}"
+            f"  NumPy determinants and contours, {size}^2: {seconds:.2f} s, "
+            f"{sum(map(len, vertices))} points, sigma median {np.median(sigma):.0e}, largest {sigma.max():.0e}"
         )
 
 

@@ -124,7 +124,7 @@ def _jacobian(options: argparse.Namespace) -> int:
     from pk_jax.files.shown import as_json, as_text, jacobians_at
 
     found = jacobians_at(named_mechanism(options.mechanism, options.unit), options.pose)
-    print(as_json(found) if options.json else as_text(found))
+    print(as_json(found._asdict()) if options.json else as_text(found))
     return 0
 
 
@@ -163,16 +163,16 @@ def _singularity(options: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         image = stack.enter_context(output_file(options.out)) if options.out else None
         if options.pose is not None:
-            found = singular.classified(named, options.pose, options.tol)
+            pose, joints, _ = configuration_at(named, options.pose, singular.signs_of(options.mode))
+            found = singular.classified(named, pose, joints, options.tol)
             print(as_json(found) if options.json else singular.classified_text(found))
             if image:
-                pose, joints, _ = configuration_at(named, options.pose)
                 axes = viz.draw_screws(named.mechanism, pose, joints)
                 axes.set_title(f"{Path(named.name).name}: {found['kind']}")
                 axes.figure.savefig(image, format=kind, dpi=150)
             return 0
         table = stack.enter_context(output_file(options.csv)) if options.csv else None
-        at = None if options.at is None else pose_of(named, options.at)
+        at = None if options.at is None else pose_of(named, options.at, "--at")
         locus = singular.locus_of(
             named,
             options.axes,
@@ -188,7 +188,7 @@ def _singularity(options: argparse.Namespace) -> int:
         if table:
             table.write(singular.locus_rows(named, locus).encode())
         if image:
-            unit = named.unit if named.path and named.unit != "1" else ""
+            unit = named.unit if (named.path or options.unit) and named.unit != "1" else ""
             figure = viz.draw_locus(named.mechanism, locus, unit=unit, scale=named.metres)
             figure.savefig(image, format=kind, dpi=150)
     return 0
@@ -422,7 +422,9 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "--range", action="append", default=[], metavar="A=LO:HI", help="range of an axis, angles in rad"
     )
-    sub.add_argument("--mode", metavar="+-+", help="one working mode (default: all)")
+    sub.add_argument(
+        "--mode", metavar="+-+", help="one working mode (default: all; with --pose: the mechanism's own)"
+    )
     sub.add_argument("--kind", action="append", choices=("I", "II"), help="only this type (default: both)")
     sub.add_argument(
         "--nodes", type=int, help="of the grid, along each axis (default: 101; 25 for three axes)"

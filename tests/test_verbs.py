@@ -410,3 +410,64 @@ def test_show(run, five_bar):
     assert "124.762" in out and "legendryflyer" in out and "unit" not in out
     out = run("show", "nam-2-rpr", "--unit", "mm")[1]
     assert "Nam, Lee and Park 2006" in out and "l_max 3000\n" in out and "y 1732.05081" in out
+
+
+def test_singularity_of_a_pose(run, here):
+    """A five-bar with its links in line is singular of type II; the screws are those of `pk.screws`."""
+    code, out, _ = run("singularity", "5-link", "--pose", "0,0.35", "--mode", "+-", "--json")
+    found, mech = json.loads(out), pk.catalogued("5-link")
+    pose = np.array([0.0, 0.35])
+    expected = pk.screws(mech, pose, mech.inverse(pose))
+    assert code == 0 and found["kind"] == "REGULAR" and found["length"] == 0.1
+    np.testing.assert_allclose(found["lines"], expected.lines, rtol=1e-12)
+    np.testing.assert_allclose(found["arms"], expected.arms, rtol=1e-12)
+    code, out, _ = run("singularity", "nam-2-rpr", "--pose", "0.5,0", "-o", "flat.png")
+    assert code == 0 and "\nTYPE_II, " in out and "arm 1" in out
+    assert Path("flat.png").read_bytes().startswith(b"\x89PNG")
+    _, out, _ = run("singularity", "nam-2-rpr", "--pose", "0.5,0.01", "--tol", "0.1")
+    assert "\nTYPE_II, " in out
+
+
+def test_singularity_maps_a_workspace(run, here, five_bar):
+    """Points of the file are singular; those of type I lie on circles of radius la + lb and lb - la, in mm."""
+    arguments = ("singularity", five_bar, "--range", "x=-420:420", "--range", "y=-420:420", "--nodes", "31")
+    code, out, _ = run(*arguments, "--kind", "I", "--csv", "points.csv", "-o", "map.svg")
+    assert code == 0 and "TYPE_I" in out and "TYPE_II" not in out and "-420 .. 420 mm" in out
+    assert "<svg" in Path("map.svg").read_text()
+    header, *lines = Path("points.csv").read_text().splitlines()
+    assert header == "curve,kind,x,y,q1,q2,mode,sigma"
+    x, y, sigma = np.array([[line.split(",")[k] for k in (2, 3, 7)] for line in lines], float).T
+    distances = np.abs([np.hypot(x - foot, y) for foot in (100, -100)])
+    off = np.min(np.abs(np.subtract.outer(distances, [269 - 139, 269 + 139])), axis=(0, 2))
+    assert len(x) > 100 and np.max(off) < 1e-6 and np.max(sigma) < 1e-9
+    assert {line.split(",")[6] for line in lines} <= {a + b for a in "+-0" for b in "+-0"} - {
+        "++",
+        "--",
+        "+-",
+    }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("nope",), "no mechanism 'nope'"),
+        (("5-link", "--axes", "x,q"), "axes must be 2 to 3 different ones of x, y, got"),
+        (("3-rrr", "--axes", "x,y,phi"), "PlanarRRR takes two, got 3"),
+        (("5-link", "--range", "x=1"), "--range must be NAME=LOWER:UPPER, got 'x=1'"),
+        (("5-link", "--range", "x=0:1"), "axes must be 2 to 3"),
+        (("5-link", "--axes", "x,y", "--range", "x=0:1"), "--range must be given for each of --axes x,y"),
+        (("5-link", "--range", "x=1:0", "--range", "y=0:1"), "lower < upper"),
+        (("5-link", "--range", "z=1:0"), "--range must name one of x, y, got 'z'"),
+        (("5-link", "--mode", "+"), "branch must have shape (2,), got (1,)"),
+        (("5-link", "--mode", "+x"), "--mode must be signs, like +-+, got '+x'"),
+        (("5-link", "--nodes", "2"), "nodes must be an integer from 3"),
+        (("5-link", "--pose", "0,0.9"), "--pose 0,0.9 is UNREACHABLE"),
+        (("5-link", "--pose", "0,0.3", "--tol", "2"), "tol must be in (0, 1), got 2"),
+        (("5-link", "-o", "map.jpg"), "-o must end in .png, .svg or .pdf, got 'map.jpg'"),
+        (("3-rrr", "--at", "0,0"), "--at"),
+    ],
+)
+def test_singularity_tells_a_mistake_in_one_line(run, here, arguments, expected):
+    code, out, err = run("singularity", *arguments)
+    assert code == 2 and not out and err.count("\n") == 1 and expected in err
+    assert not list(here.iterdir())

@@ -31,12 +31,12 @@ class Jacobians(NamedTuple):
     sigma_b: float
 
 
-def configuration_at(named: Named, text: str | None) -> tuple[Any, jax.Array, Status]:
+def configuration_at(named: Named, text: str | None, branch: Any = None) -> tuple[Any, jax.Array, Status]:
     """Home, or the pose that `text` says with its joints. ValueError where it has none."""
     if text is None:
         return *named.mechanism.home(), Status.OK
     pose = pose_of(named, text)
-    found = inverse_kinematics(named.mechanism, pose)
+    found = inverse_kinematics(named.mechanism, pose, branch)
     status = Status(int(found.status))
     if status not in (Status.OK, Status.SINGULAR):  # where a leg is stretched it can be looked at, too
         raise ValueError(f"--pose {text} is {status.name}: there are no joints for it")
@@ -60,11 +60,10 @@ def jacobians_at(named: Named, text: str | None) -> Jacobians:
     )
 
 
-def as_json(found: Jacobians) -> str:
+def as_json(found: dict[str, Any]) -> str:
     """Strict JSON; what is not finite is null."""
     plain = {
-        name: value.tolist() if isinstance(value, np.ndarray) else value
-        for name, value in found._asdict().items()
+        name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in found.items()
     }
     finite = lambda value: [finite(v) for v in value] if isinstance(value, list) else _finite(value)
     return json.dumps({name: finite(value) for name, value in plain.items()}, indent=2, allow_nan=False)

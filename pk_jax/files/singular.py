@@ -13,15 +13,13 @@ from pk_jax.analysis.singularity import SingularityKind, classify_singularity
 from pk_jax.analysis.slices import coordinate_names
 from pk_jax.files.named import Named
 from pk_jax.files.rows_file import format_rows
-from pk_jax.files.shown import configuration_at
 from pk_jax.files.stream import joint_layouts, joints_columns, output_layout, pose_columns
 from pk_jax.kinematics.statics import screws
 
 
-def classified(named: Named, pose: str | None, tol: float) -> dict[str, Any]:
-    """What kind of singularity a pose is (default: home), how far from one, and its screws; m and rad."""
+def classified(named: Named, at: Any, joints: jax.Array, tol: float) -> dict[str, Any]:
+    """What kind of singularity a configuration is, how far from one, and its screws; m and rad."""
     mech = named.mechanism
-    at, joints, _ = configuration_at(named, pose)
     found = classify_singularity(mech, at, joints, tol=tol)
     lines = screws(mech, at, joints)
     return {
@@ -81,9 +79,8 @@ def locus_of(
             [v * (1.0 if name in ("phi", "rx", "ry", "rz") else lengths) for v in given[name]]
             for name in chosen
         ]
-    signs = None if branch is None else [_sign(sign) for sign in branch.replace(",", "")]
     return singularity_locus(
-        mech, chosen, at=at, ranges=box, branch=signs, kinds=kinds, nodes=nodes, report=report
+        mech, chosen, at=at, ranges=box, branch=signs_of(branch), kinds=kinds, nodes=nodes, report=report
     )
 
 
@@ -150,10 +147,13 @@ def _range(text: str, names: tuple[str, ...]) -> tuple[str, tuple[float, float]]
     return name, found
 
 
-def _sign(sign: str) -> float:
-    if sign not in "+-":
-        raise ValueError(f"--mode must be signs, like +-+, got {sign!r}")
-    return 1.0 if sign == "+" else -1.0
+def signs_of(mode: str | None) -> list[float] | None:
+    """A working mode from its signs."""
+    if mode is None:
+        return None
+    if not mode or set(mode) - set("+-"):
+        raise ValueError(f"--mode must be signs, like +-+, got {mode!r}")
+    return [1.0 if sign == "+" else -1.0 for sign in mode]
 
 
 def _signs(mode: Any) -> str:

@@ -148,9 +148,9 @@ def _angles(names: tuple[str, ...]) -> Layout:
 # Rows in units of the user, and the solvers
 
 
-def pose_of(named: Named, text: str) -> Any:
-    """The pose that `--pose` says, as a row of `ik`."""
-    layout, row = parse_row("--pose", text, pose_layouts(named))
+def pose_of(named: Named, text: str, option: str = "--pose") -> Any:
+    """The pose that an option says, as a row of `ik`."""
+    layout, row = parse_row(option, text, pose_layouts(named))
     return jax.tree.map(lambda leaf: leaf[0], _as_pose(named, layout, row[None]))
 
 

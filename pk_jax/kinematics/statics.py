@@ -62,8 +62,8 @@ def joint_forces(mech: Mechanism, pose: Any, joints: Any, wrench: Any) -> jax.Ar
     wrench: (n,), power-conjugate to the tangent of the pose: (fx, fy), (fx, fy, moment) or (force, moment),
     moments about the platform's origin; or (batch, n). Redundant actuation: those of least norm,
     (m,) = J_F^+ W (a joint force counts times length() beside torques, where joints are of both kinds).
-    Sensors carry no force. NaN at a type II singularity, where some wrench has no forces; zero
-    at a joint of a type I singularity.
+    Sensors carry no force. NaN at a type II singularity, where some wrench has no forces, and for
+    redundant actuation where the closure equations are dependent; zero at a joint of a type I singularity.
     """
     return _over("joint_forces", _joint_forces, mech, pose, joints, wrench=wrench)
 
@@ -71,7 +71,7 @@ def joint_forces(mech: Mechanism, pose: Any, joints: Any, wrench: Any) -> jax.Ar
 def platform_wrench(mech: Mechanism, pose: Any, joints: Any, forces: Any) -> jax.Array:
     """The wrench that joint forces (m,) exert on the platform, W = J_F tau. -> (n,)
 
-    Conventions of `joint_forces`. Not finite at a type I singularity, where a leg exerts any force.
+    Conventions of `joint_forces`. NaN at a type I singularity, where a leg can exert any force.
     """
     return _over("platform_wrench", _platform_wrench, mech, pose, joints, forces=forces)
 
@@ -79,7 +79,8 @@ def platform_wrench(mech: Mechanism, pose: Any, joints: Any, forces: Any) -> jax
 def preloads(mech: Mechanism, pose: Any, joints: Any) -> jax.Array:
     """Joint forces that balance one another: an orthonormal basis of the null space of J_F. -> (c - n, m)
 
-    Empty where actuation is not redundant. Sensors carry no force.
+    Empty where actuation is not redundant. Sensors carry no force. NaN where the closure equations are
+    dependent.
     """
     return _over("preloads", _preloads, mech, pose, joints)
 
@@ -87,7 +88,7 @@ def preloads(mech: Mechanism, pose: Any, joints: Any) -> jax.Array:
 def stiffness(mech: Mechanism, pose: Any, joints: Any, k: Any) -> jax.Array:
     """Stiffness of the platform, K = J_F diag(k) J_F^T, for joints of stiffness k () or (m,). -> (n, n)
 
-    Actuators without preload; sensors count nothing. Infinite or NaN at a type I singularity.
+    Actuators without preload; sensors count nothing. NaN at a type I singularity.
     Source: Gosselin 1990, IEEE Trans. Robotics and Automation 6(3).
     """
     _, joints_like = home_shapes(mech)
@@ -120,12 +121,10 @@ def bounded_joint_forces(
     _, joints_like = home_shapes(mech)
     bounds = []
     for name, bound in (("lower", lower), ("upper", upper)):
-        bound = checks.real_numpy(name, bound)
-        if bound.shape not in ((), joints_like.shape) or np.any(np.isnan(bound)):
-            raise ValueError(
-                f"{name} must be numbers of shape () or {joints_like.shape}, got {bound.tolist()}"
-            )
-        bounds.append(jnp.broadcast_to(jnp.asarray(bound, joints_like.dtype), joints_like.shape))
+        bound = checks.real_array(name, bound)
+        if bound.shape not in ((), joints_like.shape):
+            raise ValueError(f"{name} must have shape () or {joints_like.shape}, got {bound.shape}")
+        bounds.append(jnp.broadcast_to(bound.astype(joints_like.dtype), joints_like.shape))
     if checks.is_concrete(bounds) and not np.all(np.asarray(bounds[0]) <= np.asarray(bounds[1])):  # NaN, too
         raise ValueError(f"lower must be at most upper, got {np.asarray(lower)} and {np.asarray(upper)}")
     return _over(
@@ -198,41 +197,54 @@ def _actuated(mech: Mechanism, pose: Any, joints: jax.Array) -> tuple[jax.Array,
     return scaled.pose[rows], scaled.joints[rows], of_pose, of_joints
 
 
-def _is_singular(a: jax.Array) -> jax.Array:
-    return jnp.linalg.svd(a, compute_uv=False)[-1] < SINGULAR_BELOW
-
-
 def _joint_forces(mech: Mechanism, pose: Any, joints: jax.Array, wrench: jax.Array) -> jax.Array:
     a, b, of_pose, of_joints = _actuated(mech, pose, joints)
     c, n = a.shape
-    right = -wrench * of_pose
-    singular = _is_singular(a)
-    if c == n:
-        lagrange = jnp.linalg.solve(jnp.where(singular, jnp.eye(n, dtype=a.dtype), a).T, right)
-    else:  # least |B^T lambda| with A^T lambda = right
-        zero = jnp.zeros((n, n), a.dtype)
-        system = jnp.block([[b @ b.T, a], [a.T, zero]])
-        system = jnp.where(singular, jnp.eye(c + n, dtype=a.dtype), system)
-        lagrange = jnp.linalg.solve(system, jnp.concatenate([jnp.zeros(c, a.dtype), right]))[:c]
+    singular = jnp.linalg.svd(a, compute_uv=False)[-1] < SINGULAR_BELOW
+    a = jnp.where(singular, jnp.eye(c, n, dtype=a.dtype), a)
+    q, r = jnp.linalg.qr(a)
+    lagrange = -q @ jnp.linalg.solve(r.T, wrench * of_pose)  # A^T lambda = -W
+    if c > n:  # and of all such the one with the least |B^T lambda|
+        rest = b.T - (b.T @ q) @ q.T
+        singular = singular | _is_dependent(rest, c - n)
+        preload = jnp.linalg.pinv(rest, rtol=SINGULAR_BELOW / 1e3) @ (b.T @ lagrange)
+        lagrange = lagrange - preload + q @ (q.T @ preload)
     return jnp.where(singular, jnp.nan, b.T @ lagrange / of_joints)
 
 
-def _platform_wrench(mech: Mechanism, pose: Any, joints: jax.Array, forces: jax.Array) -> jax.Array:
+def _is_dependent(rest: jax.Array, degrees: int) -> jax.Array:
+    """Whether some preload does not reach the joints: [A B] has dependent rows."""
+    sigma = jnp.linalg.svd(rest, compute_uv=False)
+    return ~(sigma[degrees - 1] > SINGULAR_BELOW * jnp.maximum(sigma[0], 1))
+
+
+def _wrenches(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
+    """Wrenches of unit joint forces, J_F^T: none of sensors, NaN of a leg at type I. -> (m, n)"""
     lines, arms, _ = _screws(mech, pose, joints)
+    unit = units(mech.joint_units or (1,) * joints.shape[0], arms.dtype)
+    is_singular = jnp.abs(arms) < SINGULAR_BELOW * mech.length() ** (1 - unit)
     carries = jnp.arange(joints.shape[0]) < (mech.actuated_rows or joints.shape[0])
-    return lines.T @ jnp.where(carries, forces / arms, 0)
+    per_force = lines / jnp.where(is_singular, jnp.nan, arms)[:, None]
+    return jnp.where(carries[:, None], per_force, 0)
+
+
+def _platform_wrench(mech: Mechanism, pose: Any, joints: jax.Array, forces: jax.Array) -> jax.Array:
+    return _wrenches(mech, pose, joints).T @ forces
 
 
 def _preloads(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
     a, b, _, of_joints = _actuated(mech, pose, joints)
+    degrees = a.shape[0] - a.shape[1]
     balanced = jnp.linalg.svd(a)[0][:, a.shape[1] :]  # A^T lambda = 0
-    return jnp.linalg.qr((b / of_joints).T @ balanced)[0].T
+    if not degrees:
+        return jnp.zeros((0, b.shape[1]), b.dtype)
+    is_dependent = _is_dependent(b.T @ balanced, degrees)
+    return jnp.where(is_dependent, jnp.nan, jnp.linalg.qr((b / of_joints).T @ balanced)[0].T)
 
 
 def _stiffness(mech: Mechanism, pose: Any, joints: jax.Array, k: jax.Array) -> jax.Array:
-    lines, arms, _ = _screws(mech, pose, joints)
-    carries = jnp.arange(joints.shape[0]) < (mech.actuated_rows or joints.shape[0])
-    return lines.T @ (jnp.where(carries, k / arms**2, 0)[:, None] * lines)
+    wrenches = _wrenches(mech, pose, joints)
+    return wrenches.T @ (k[:, None] * wrenches)
 
 
 def _bounded(

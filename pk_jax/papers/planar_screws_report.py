@@ -50,7 +50,7 @@ def report_into(
 
 
 def _judged(case: Case) -> tuple[Any, ...]:
-    """A row of the table; the last column is how far the constructed screws are from those of the residual."""
+    """A row of the table; last, how far the constructed screws are from those of the residual."""
     found = classify_singularity(case.mechanism, case.pose, case.joints)
     drawn, derived = (f(case.mechanism, case.pose, case.joints) for f in (geometric_screws, screws))
     off = np.max(np.abs(np.asarray(drawn.lines) - np.asarray(derived.lines)))

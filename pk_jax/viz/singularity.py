@@ -95,7 +95,7 @@ def _draw_free_motion(mech: Mechanism, pose: Any, joints: jax.Array, ax: Axes, s
 
 
 def singular_configurations(cases: Sequence[Any], columns: int = 4) -> Figure:
-    """Robots in singular configurations with their screws: cases of figure, title, mechanism, pose, joints."""
+    """Robots in singular configurations, with screws; a case has figure, title, mechanism, pose, joints."""
     rows = -(-len(cases) // columns)
     figure = new_figure(3.1 * columns, 3.0 * rows)
     for number, case in enumerate(cases, 1):

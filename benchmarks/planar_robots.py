@@ -128,7 +128,7 @@ def locus(nodes: int) -> None:
         sigma = exactness(robot, vertices)
         print(
             f"  NumPy determinants and contours, {size}^2: {seconds:.2f} s, "
-            f"{sum(map(len, vertices))} points, sigma median {np.median(sigma):.0e}, largest {sigma.max():.0e}"
+            f"{sum(map(len, vertices))} points, sigma {np.median(sigma):.0e}, largest {sigma.max():.0e}"
         )
 
 

@@ -429,7 +429,7 @@ def test_singularity_of_a_pose(run, here):
 
 
 def test_singularity_maps_a_workspace(run, here, five_bar):
-    """Points of the file are singular; those of type I lie on circles of radius la + lb and lb - la, in mm."""
+    """Points of the file are singular; those of type I lie on circles of radius la + lb or lb - la."""
     arguments = ("singularity", five_bar, "--range", "x=-420:420", "--range", "y=-420:420", "--nodes", "31")
     code, out, _ = run(*arguments, "--kind", "I", "--csv", "points.csv", "-o", "map.svg")
     assert code == 0 and "TYPE_I" in out and "TYPE_II" not in out and "-420 .. 420 mm" in out
@@ -452,7 +452,10 @@ def test_singularity_maps_a_workspace(run, here, five_bar):
     [
         (("nope",), "no mechanism 'nope'"),
         (("5-link", "--axes", "x,q"), "axes must be 2 to 3 different ones of x, y, got"),
-        (("3-rrr", "--axes", "x,y,phi"), "PlanarRRR takes two, got 3"),
+        (
+            ("3-rrr", "--axes", "x,y,phi"),
+            "axes must be two here: the loci of PlanarRRR over 3 axes are no curves",
+        ),
         (("5-link", "--range", "x=1"), "--range must be NAME=LOWER:UPPER, got 'x=1'"),
         (("5-link", "--range", "x=0:1"), "axes must be 2 to 3"),
         (("5-link", "--axes", "x,y", "--range", "x=0:1"), "--range must be given for each of --axes x,y"),

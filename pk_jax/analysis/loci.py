@@ -108,8 +108,9 @@ def singularity_locus(
     kinds = tuple(kinds) if not isinstance(kinds, str) else (kinds,)
     if not kinds or set(kinds) - {"I", "II"}:
         raise ValueError(f'kinds must be of "I", "II", got {kinds}')
+    axes = tuple(axes.split(",")) if isinstance(axes, str) else axes
+    kinds = _curves_of(mech, 2 if axes is None else len(axes), kinds)
     where = slice_of(mech, axes, at, ranges)
-    kinds = _curves_of(mech, where, kinds)
     nodes = checks.is_count("nodes", NODES[len(where.axes)] if nodes is None else nodes, least=3, most=2001)
     length = mech.length() if length is None else checks.real_array("length", length)
     modes = working_modes(mech)
@@ -161,17 +162,16 @@ def singularity_locus(
 _KINDS = {"I": SingularityKind.TYPE_I, "II": SingularityKind.TYPE_II}
 
 
-def _curves_of(mech: Mechanism, where: Slice, kinds: tuple[str, ...]) -> tuple[str, ...]:
-    """The kinds whose locus is made of curves or points in this slice; ValueError where none is."""
+def _curves_of(mech: Mechanism, d: int, kinds: tuple[str, ...]) -> tuple[str, ...]:
+    """The kinds whose locus is made of curves or points over d axes; ValueError where none is."""
     pose, joints = home_shapes(mech)
     a = jax.eval_shape(pose_jacobian, mech, pose, joints)
     equations, n = a.shape[0] if mech.actuated_rows is None else mech.actuated_rows, a.shape[1]
     codimension = {"I": 1, "II": equations - n + 1}
-    d = len(where.axes)
     found = tuple(kind for kind in kinds if codimension[kind] >= d - 1)
     if not found:
         raise ValueError(
-            f"loci of codimension 1 are surfaces over three axes: {type(mech).__name__} takes two, got {d}"
+            f"axes must be two here: the loci of {type(mech).__name__} over {d} axes are no curves"
         )
     return tuple(kind for kind in found if codimension[kind] <= d)
 

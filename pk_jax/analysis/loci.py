@@ -37,7 +37,10 @@ POLISHED = 40  # steps of Gauss-Newton at most: they halve the distance where tw
 EXACT = 1e-10  # |system| of a point of a locus
 SINGULAR_NODES = 0.2  # of all nodes of a mode: so many are no curve, but the whole slice
 STEP = 0.012  # of the box, 3 rad or a unit vector: distance of the points of a curve
-MOST_POINTS = 2000  # of a curve, one way
+ASIDE = STEP / 8  # from the polygon of a curve: what is farther is on another one
+LEAST_STEP = 1e-5
+AT_A_TIME = 1000  # points of a curve
+MOST_TRIES = 100_000  # steps along a curve, one way
 CORRECTED = 6  # Gauss-Newton steps after each step along the curve
 
 Report = Callable[..., None]
@@ -137,7 +140,8 @@ def singularity_locus(
     for kind in kinds:
         starts = []
         for mode, sigma, q in zip(modes, sigmas[kind], joints, strict=True):
-            if np.nanmean(sigma < 1e-9) > SINGULAR_NODES if np.isfinite(sigma).any() else False:
+            there = sigma[np.isfinite(sigma)]
+            if there.size and np.mean(there < EXACT) > SINGULAR_NODES:
                 everywhere.append((_KINDS[kind], mode))
                 continue
             seeds = np.flatnonzero(_seeds(sigma, kind))
@@ -233,9 +237,7 @@ class _Follower:
             say(f"type {self.kind} curves, points left", whole - len(points), whole)
             pieces.append(self._followed(points[0]))
             points = points[1:]
-            near = self._features(pieces[-1].track)
-            if len(points):
-                points = points[self._distances(self._features(points), near) > 1.5 * STEP]
+            points = points[self._distances(points, pieces[-1]) > ASIDE]
         return self._curves(self._without_repeats(pieces), modes, one_mode)
 
     def _polished(self, starts: np.ndarray, say: Report) -> np.ndarray:
@@ -260,13 +262,15 @@ class _Follower:
         lower, upper = (
             jnp.asarray(edge) / self.scale[: self.d] for edge in (self.where.lower, self.where.upper)
         )
+        of, begin = (self.where.axes, self.kind), jnp.asarray(start)
         ways = []
         for way in (1.0, -1.0):
-            track, count, is_closed = _follow(
-                *self.given, lower, upper, jnp.asarray(start), way, self.where.axes, self.kind
-            )
-            ways.append(np.asarray(track)[: int(count)])
-            if bool(is_closed):
+            walk, parts = _begun(*self.given, begin, way, *of), [np.zeros((0, len(start)))]
+            while not walk.is_over and walk.tries < MOST_TRIES:
+                track, count, walk = _follow(*self.given, lower, upper, begin, walk, *of)
+                parts.append(np.asarray(track)[: int(count)])
+            ways.append(np.concatenate(parts))
+            if walk.is_closed:
                 return self._piece(np.concatenate([start[None], ways[0]]), True)
         return self._piece(np.concatenate([ways[1][::-1], start[None], ways[0]]), False)
 
@@ -283,27 +287,30 @@ class _Follower:
         coordinates, joints = points[:, : self.d], points[:, self.d : self.d + self.m]
         angles = (joints * scale[self.d : self.d + self.m])[:, self.joint_units == 0]
         turns = [np.cos(angles) / 3, np.sin(angles) / 3]
-        return np.concatenate([coordinates, joints[:, self.joint_units > 0], *turns], axis=1)
+        lengths = joints[:, self.joint_units > 0]
+        lengths = np.abs(lengths) if self.mech.joints_are_distances else lengths  # only squares are known
+        return np.concatenate([coordinates, lengths, *turns], axis=1)
 
-    @staticmethod
-    def _distances(features: np.ndarray, others: np.ndarray) -> np.ndarray:
-        """From each to the nearest of the others. -> (rows,)"""
+    def _distances(self, points: np.ndarray, piece: Piece) -> np.ndarray:
+        """From each point to the polygon of a curve. -> (points,)"""
+        features, corners = self._features(points), self._features(piece.track)
+        if piece.is_closed or len(corners) == 1:
+            corners = np.concatenate([corners, corners[:1]])
         least = np.full(len(features), np.inf)
-        for first in range(0, len(others), 256):
-            apart = features[:, None] - others[None, first : first + 256]
-            least = np.minimum(least, np.sqrt(np.sum(apart**2, axis=2)).min(axis=1))
+        for begin, side in zip(corners, np.diff(corners, axis=0), strict=False):
+            offset = features - begin
+            along = np.clip(offset @ side / max(side @ side, 1e-300), 0, 1)
+            least = np.minimum(least, np.linalg.norm(offset - along[:, None] * side, axis=1))
         return least
 
     def _without_repeats(self, pieces: list[Piece]) -> list[Piece]:
         """Single points that lie on a curve are dropped, and all but one of those that coincide."""
         kept = [piece for piece in pieces if len(piece.track) > 1]
-        features = [self._features(piece.track) for piece in kept]
         for piece in pieces:
-            feature = self._features(piece.track)
-            is_new = not features or self._distances(feature[:1], np.concatenate(features))[0] > 1.5 * STEP
-            if len(piece.track) == 1 and is_new:
+            if len(piece.track) == 1 and all(
+                self._distances(piece.track, other)[0] > ASIDE for other in kept
+            ):
                 kept.append(piece)
-                features.append(feature)
         return kept
 
     def _curves(self, pieces: list[Piece], modes: np.ndarray, one_mode: bool) -> list[LocusCurve]:
@@ -316,7 +323,7 @@ class _Follower:
         values, joints, motion = np.split(points * np.asarray(self.scale), (self.d, self.d + self.m), axis=1)
         joints = np.where(self.joint_units > 0, joints, np.arctan2(np.sin(joints), np.cos(joints)))
         if self.mech.joints_are_distances:
-            joints = np.abs(joints)  # the equations know only the square
+            joints = np.abs(joints)
         pose = poses_on(self.where.at, self.where.axes, jnp.asarray(values))
         found = classify_singularity(self.mech, pose, joints, length=self.length)
         sigma = np.asarray(found.sigma_inverse if self.kind == "I" else found.sigma_direct)
@@ -343,15 +350,16 @@ class _Follower:
         for mode in every:
             gap = joints_of(self.mech, pose, mode) - joints
             gap = np.where(self.joint_units > 0, gap, 2 * np.sin(gap / 2))
-            gaps.append(np.max(np.abs(gap), axis=1))
-        gaps = np.where(np.isfinite(gaps), gaps, np.inf)
+            # an arm that is out of reach by a rounding is as good in either mode
+            gaps.append(np.max(np.nan_to_num(np.abs(gap)), axis=1))
+        gaps = np.array(gaps)
         best = np.min(gaps, axis=0)
         fits = gaps <= np.maximum(2 * best, 1e-4)  # at a reach limit two modes differ by the root of roundoff
         signs = np.einsum("jk,js->ks", fits, every)
         return np.sign(np.where(np.abs(signs) == fits.sum(axis=0)[:, None], signs, 0))
 
 
-def _part(curve: LocusCurve, rows: slice) -> LocusCurve:
+def _part(curve: LocusCurve, rows: Any) -> LocusCurve:
     fields = jax.tree.map(lambda leaf: leaf[rows], tuple(curve[1:7]))
     return LocusCurve(curve.kind, *fields, False)
 
@@ -361,6 +369,11 @@ def _in_mode(curve: LocusCurve, mode: np.ndarray) -> list[LocusCurve]:
     is_wanted = np.all((curve.branch == mode) | (curve.branch == 0), axis=1)
     if is_wanted.all():
         return [curve]
+    if curve.is_closed and is_wanted.any():  # begin where a run does
+        first = int(np.flatnonzero(is_wanted & ~np.roll(is_wanted, 1))[0])
+        is_wanted = np.roll(is_wanted, -first)
+        turned = np.roll(np.arange(len(is_wanted)), -first)
+        curve = _part(curve, turned)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], is_wanted.astype(int), [0]])))
     return [_part(curve, slice(a, b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
@@ -431,69 +444,73 @@ def _toward(system: Callable, y: jax.Array) -> jax.Array:
 
 
 class _Walk(NamedTuple):
-    count: jax.Array
+    """Where on a curve, and where to."""
+
     y: jax.Array
     tangent: jax.Array
     step: jax.Array
-    track: jax.Array
+    count: jax.Array  # points so far
     is_over: jax.Array
     is_closed: jax.Array
     tries: jax.Array
 
 
+@partial(jax.jit, static_argnums=(6, 7))
+def _begun(mech, at, length, scale, start, way, axes, kind):
+    """The walk that leaves a point of a curve one way, or that is over where there is no curve."""
+    _, sigma, rows = jnp.linalg.svd(
+        jax.jacfwd(partial(_system, mech, at, length, scale, axes=axes, kind=kind))(start)
+    )
+    is_curve = sigma[-1] > 1e-7 * sigma[0] if sigma.shape[0] < start.shape[0] else jnp.asarray(False)
+    zero, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    return _Walk(start, way * rows[-1], jnp.asarray(STEP / 4, start.dtype), zero, ~is_curve, no, zero)
+
+
 @partial(jax.jit, static_argnums=(8, 9))
-def _follow(mech, at, length, scale, lower, upper, start, way, axes, kind):
-    """Along the curve from a point until the box ends or it closes: its track, how many points, is_closed."""
-    d = len(axes)
-    system = lambda y: _system(mech, at, length, scale, y, axes, kind)
-    jacobian = jax.jacfwd(system)
+def _follow(mech, at, length, scale, lower, upper, start, walk, axes, kind):
+    """Along the curve that passes `start` until the box ends or it closes: points, how many, the walk."""
+    d, m = len(axes), _joint_count(mech)
+    system = partial(_system, mech, at, length, scale, axes=axes, kind=kind)
+    is_angle = np.asarray(mech.joint_units or (1,) * m) == 0
+    sized = jnp.abs if mech.joints_are_distances else lambda q: q
 
-    def tangent_at(y):
-        _, sigma, rows = jnp.linalg.svd(jacobian(y))
-        is_curve = sigma[-1] > 1e-7 * sigma[0] if sigma.shape[0] < y.shape[0] else jnp.asarray(False)
-        return rows[-1], is_curve
-
-    def gap(y, other):
-        """Distance along the curve: angles have no turns, motions no sign."""
-        m = _joint_count(mech)
-        is_angle = np.asarray(mech.joint_units or (1,) * m) == 0
-        apart, q_scale = y - other, scale[d : d + m]
-        joints = apart[d : d + m]
-        joints = jnp.where(is_angle, 2 * jnp.sin(joints * q_scale / 2) / q_scale, joints)
-        v, w = y[d + m :], other[d + m :]
+    def gap(y):
+        """Distance from the start: angles have no turns, motions no sign, distances neither."""
+        apart = y[d : d + m] - start[d : d + m]
+        turned = 2 * jnp.sin(apart * scale[d : d + m] / 2) / scale[d : d + m]
+        joints = jnp.where(is_angle, turned, sized(y[d : d + m]) - sized(start[d : d + m]))
+        v, w = y[d + m :], start[d + m :]
         motions = jnp.where(v @ w < 0, v + w, v - w)
-        return jnp.linalg.norm(jnp.concatenate([apart[:d], joints, motions]))
+        return jnp.linalg.norm(jnp.concatenate([y[:d] - start[:d], joints, motions]))
 
-    def advance(walk):
+    def advance(state):
+        walk, track, begin = state
         predicted = walk.y + walk.step * walk.tangent
         y = lax.fori_loop(0, CORRECTED, lambda _, y: y - _toward(system, y), predicted)
-        tangent, _ = tangent_at(y)
+        tangent = jnp.linalg.svd(jax.jacfwd(system)(y))[2][-1]
         along = tangent @ walk.tangent
-        tangent = tangent * jnp.where(along < 0, -1, 1)
         is_good = (jnp.max(jnp.abs(system(y))) <= EXACT * 1e-2) & (jnp.abs(along) > 0.9)
         is_good &= jnp.linalg.norm(y - predicted) <= 0.5 * walk.step
-        inside = jnp.all((y[:d] >= lower) & (y[:d] <= upper))
-        is_closed = is_good & (walk.count > 3) & (gap(y, start) < 0.8 * walk.step)
-        keep = is_good & ~is_closed
-        track = walk.track.at[walk.count].set(jnp.where(keep, y, walk.track[walk.count]))
-        count = walk.count + keep
+        is_good &= jnp.all((y[:d] >= lower) & (y[:d] <= upper))
+        is_closed = is_good & (walk.count > 3) & (gap(y) < 0.8 * walk.step)
+        place = walk.count - begin
+        track = track.at[place].set(jnp.where(is_good & ~is_closed, y, track[place]))
         step = jnp.where(is_good, jnp.minimum(1.4 * walk.step, STEP), walk.step / 2)
-        is_over = is_closed | (is_good & ~inside) | (step < 1e-5) | (count >= MOST_POINTS)
-        return _Walk(
-            count,
+        onward = _Walk(
             jnp.where(is_good, y, walk.y),
-            jnp.where(is_good, tangent, walk.tangent),
+            jnp.where(is_good, tangent * jnp.where(along < 0, -1, 1), walk.tangent),
             step,
-            track,
-            is_over,
-            walk.is_closed | is_closed,
+            walk.count + (is_good & ~is_closed),
+            is_closed | (step < LEAST_STEP),
+            is_closed,
             walk.tries + 1,
         )
+        return onward, track, begin
 
-    tangent, is_curve = tangent_at(start)
-    zero = jnp.zeros((), jnp.int32)
-    no = jnp.zeros((), bool)
-    track = jnp.zeros((MOST_POINTS, start.shape[0]), start.dtype)
-    walk = _Walk(zero, start, way * tangent, jnp.asarray(STEP / 4, start.dtype), track, ~is_curve, no, zero)
-    walk = lax.while_loop(lambda w: ~w.is_over & (w.tries < 3 * MOST_POINTS), advance, walk)
-    return walk.track, walk.count, walk.is_closed
+    def goes_on(state):
+        walk, _, begin = state
+        return ~walk.is_over & (walk.count - begin < AT_A_TIME) & (walk.tries < MOST_TRIES)
+
+    track = jnp.zeros((AT_A_TIME, start.shape[0]), start.dtype)
+    walk, track, begin = lax.while_loop(goes_on, advance, (walk, track, walk.count))
+    return track, walk.count - begin, walk

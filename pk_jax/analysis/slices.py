@@ -22,7 +22,7 @@ from pk_jax.mechanisms.base import Mechanism
 
 SPACE = ("x", "y", "z", "rx", "ry", "rz")
 BLOCK = 2048  # poses solved at a time
-COARSE = 24  # nodes along each axis when the reach is sought
+COARSE = 32  # nodes along each axis when the reach is sought
 FAR = 4  # times the size of the mechanism: where the reach is sought
 
 
@@ -165,10 +165,10 @@ def _reach(mech: Mechanism, found: Slice) -> tuple[np.ndarray, np.ndarray]:
                 spans.append((line[0], line[-1]))
                 continue
             at_ends = inside[0] == 0, inside[-1] == COARSE - 1
-            wide = [COARSE if at_end else 1 for at_end in at_ends]
+            wide = [COARSE if at_end else 2 for at_end in at_ends]  # tips lie between the nodes
             is_cut |= any(at_ends)
             spans.append((line[inside[0]] - wide[0] * step, line[inside[-1]] + wide[1] * step))
         lower, upper = np.array(spans).T
-        if not is_cut and attempt >= 2:
+        if not is_cut and attempt >= 3:
             break
     return lower, upper

@@ -59,7 +59,9 @@ def draw_screws(mech: Mechanism, pose: Any, joints: jax.Array, ax: Axes | None =
         ends = middle + np.array([[-0.75], [0.75]]) * size * force
         ax.plot(*ends.T, color=BLUE, linewidth=1.1, linestyle=(0, (5, 3)), zorder=2)
     if d == 2:
-        _draw_free_motion(mech, pose, joints, ax, size)
+        pole = _draw_free_motion(mech, pose, joints, ax, size)
+        if pole is not None and np.max(np.abs(pole - centre)) < 1.5 * size:
+            points = np.concatenate([points, pole[None]])
         margin = 0.16 * size
         ax.set_xlim(points[:, 0].min() - margin, points[:, 0].max() + margin)
         ax.set_ylim(points[:, 1].min() - margin, points[:, 1].max() + margin)
@@ -73,12 +75,15 @@ def _foot(force: np.ndarray, moment: np.ndarray) -> np.ndarray:
     return np.cross(force, moment) if moment.size == 3 else np.zeros_like(force)
 
 
-def _draw_free_motion(mech: Mechanism, pose: Any, joints: jax.Array, ax: Axes, size: float) -> None:
+def _draw_free_motion(
+    mech: Mechanism, pose: Any, joints: jax.Array, ax: Axes, size: float
+) -> np.ndarray | None:
+    """The pole of the motion that locked actuators leave free, where it has one."""
     if classify_singularity(mech, pose, joints).kind not in (
         SingularityKind.TYPE_II,
         SingularityKind.TYPE_III,
     ):
-        return
+        return None
     length = float(mech.length())
     a = np.asarray(scaled_rows(mech, pose, joints, mech.length())[0])
     twist = np.linalg.svd(a)[2][-1] * length ** np.asarray(pose_units(pose, mech.pose_units))
@@ -86,18 +91,20 @@ def _draw_free_motion(mech: Mechanism, pose: Any, joints: jax.Array, ax: Axes, s
     turn = twist[2] if twist.size == 3 else 0.0
     if abs(turn) * size > 1e-3 * np.linalg.norm(twist[:2]):
         pole = at + np.array([-twist[1], twist[0]]) / turn
-        ax.plot(*pole, marker="X", markersize=9, color=VERMILION, zorder=6, clip_on=True)
-        return
+        ax.plot(*pole, marker="X", markersize=9, color=VERMILION, zorder=6)
+        return pole
     slide = 0.2 * size * twist[:2] / np.linalg.norm(twist[:2])
     for way in (slide, -slide):
         arrow = {"arrowstyle": "-|>", "color": VERMILION, "linewidth": 1.6}
-        ax.annotate("", at + way, at, arrowprops=arrow, zorder=6)
+        ax.annotate("", at + way, at, arrowprops=arrow, zorder=6, annotation_clip=False)
+    return None
 
 
 def singular_configurations(cases: Sequence[Any], columns: int = 4) -> Figure:
     """Robots in singular configurations, with screws; a case has figure, title, mechanism, pose, joints."""
     rows = -(-len(cases) // columns)
-    figure = new_figure(3.1 * columns, 3.0 * rows)
+    figure = new_figure(3.3 * columns, 3.1 * rows)
+    figure.set_layout_engine("constrained")  # panels of many shapes
     for number, case in enumerate(cases, 1):
         ax = draw_screws(case.mechanism, case.pose, case.joints, figure.add_subplot(rows, columns, number))
         found = classify_singularity(case.mechanism, case.pose, case.joints)

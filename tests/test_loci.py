@@ -599,7 +599,7 @@ def test_the_unit_of_length_does_not_matter():
     scaled = pk.singularity_locus(large, nodes=41)
     np.testing.assert_allclose(box(scaled), 1000 * box(found), rtol=1e-12)
     for kind in (ONE, TWO):
-        # polygons of other corners: they begin where a rounding tells them to
-            np.testing.assert_allclose(length_of(scaled, kind), 1000 * length_of(found, kind), rtol=5e-3)
+        # polygons of other corners: a rounding tells them where to begin
+        np.testing.assert_allclose(length_of(scaled, kind), 1000 * length_of(found, kind), rtol=5e-3)
         one, other = 1000 * points_of(found, kind)[0], points_of(scaled, kind)[0]
         assert max(farthest(one, other, box(scaled)), farthest(other, one, box(scaled))) <= STEP

@@ -56,7 +56,8 @@ def draw_screws(mech: Mechanism, pose: Any, joints: jax.Array, ax: Axes | None =
             continue  # a pure couple has no line
         foot = origin + _foot(force, line[d:])
         middle = foot + (centre - foot) @ force * force  # the part of the line that is in sight
-        ends = middle + np.array([[-0.75], [0.75]]) * size * force
+        reach = 3 * size if d == 2 else 0.75 * size  # in the plane the frame cuts it
+        ends = middle + np.array([[-reach], [reach]]) * force
         ax.plot(*ends.T, color=BLUE, linewidth=1.1, linestyle=(0, (5, 3)), zorder=2)
     if d == 2:
         pole = _draw_free_motion(mech, pose, joints, ax, size)

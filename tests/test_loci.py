@@ -473,10 +473,11 @@ def test_the_six_link_has_only_the_circles_of_its_arms():
 # ---------------------------------------------------------------- in space
 
 
-def test_yaw_of_90_degrees_of_a_semi_regular_platform_with_sensors():
-    """Fichter: six legs; three more rows are sensors and carry nothing."""
+@pytest.mark.parametrize("sensors", [0, pytest.param(3, marks=pytest.mark.soak)])
+def test_yaw_of_90_degrees_of_a_semi_regular_platform(sensors):
+    """Fichter: six legs; more rows are sensors and carry nothing."""
     semi = pk.catalogued("semi-regular-stewart")
-    more = np.pad(np.random.default_rng(8).uniform(-1, 1, (3, 2)), ((0, 0), (0, 1)))
+    more = np.pad(np.random.default_rng(8).uniform(-1, 1, (sensors, 2)), ((0, 0), (0, 1)))
     mech = pk.Stewart(
         base=np.concatenate([semi.base, more]), platform=np.concatenate([semi.platform, more / 3])
     )

@@ -69,13 +69,11 @@ LAWFUL = {
     "3-rrr": lambda: catalogued("3-rrr"),
     "3-rrr, irregular": equal_arms,
     "4-rrr": lambda: catalogued("4-rrr"),
-    "5-rrr, no two arms alike": lambda: arms(5),
     "6-link": lambda: catalogued("6-link"),
     "6-link, irregular": equal_six_link,
     "sauer-3-rpr": lambda: catalogued("sauer-3-rpr"),
     "arte-3-rpr": lambda: catalogued("arte-3-rpr"),
     "3-rpr, irregular": lambda: legs(3),
-    "4-rpr, irregular": lambda: legs(4),
     "5-link": lambda: catalogued("5-link"),
     "5-link, coaxial": lambda: pk.FiveBar(half_base=0.0, proximal=0.23, distal=0.35),
 }

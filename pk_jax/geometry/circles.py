@@ -16,6 +16,7 @@ CLOSED_TO = 1e-10  # of the size of the equations
 APART = 1e-6  # of the size: two poses are two
 
 
+@jax.jit
 def platforms_on_circles(
     platform: jax.Array, centres: jax.Array, radii: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -28,8 +29,8 @@ def platforms_on_circles(
     given = platform, centres, radii
     known = lax.stop_gradient(given)
     poses = _candidates(*known)
-    for _ in range(POLISHED):
-        poses = _newton(poses, *known, jnp.ones(poses.shape[0], bool))
+    every = jnp.ones(poses.shape[0], bool)
+    poses = lax.fori_loop(0, POLISHED, lambda _, poses: _newton(poses, *known, every), poses)
 
     size, eps = _size(*known), jnp.finfo(poses.dtype).eps
     turns = jnp.arctan2(jnp.sin(poses[:, 2]), jnp.cos(poses[:, 2]))

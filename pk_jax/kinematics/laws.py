@@ -76,7 +76,7 @@ def _check_contract(mech: Mechanism, name: str) -> None:
             raise ValueError(
                 f"{name}.{attribute} must be {count} numbers, 1 = length and 0 = angle, got {units}"
             )
-    f, a = mech.linearize(pose, joints)
+    f, a = jax.eval_shape(mech.linearize, pose, joints)  # shapes alone: op by op it would be slow
     if f.shape != (c,) or a.shape != (c, n):
         raise ValueError(
             f"{name}.linearize must give shapes {(c,)} and {(c, n)}, got {f.shape} and {a.shape}"
@@ -92,10 +92,10 @@ def _check_contract(mech: Mechanism, name: str) -> None:
     indices = {index for segment in segments for index in segment} | set(ground)
     if not indices <= set(range(points.shape[0])):
         raise ValueError(f"{name}.skeleton names points that it does not have: {sorted(indices)}")
-    if hasattr(mech, "inverse") and mech.inverse(pose).shape != (m,):
-        raise ValueError(f"{name}.inverse must have shape {(m,)}, got {mech.inverse(pose).shape}")
+    if hasattr(mech, "inverse") and (shape := jax.eval_shape(mech.inverse, pose).shape) != (m,):
+        raise ValueError(f"{name}.inverse must have shape {(m,)}, got {shape}")
     if hasattr(mech, "forward"):
-        poses, is_real = mech.forward(joints)
+        poses, is_real = jax.eval_shape(mech.forward, joints)
         wanted = [leaf.shape for leaf in jax.tree.leaves(pose)]
         shapes = [leaf.shape for leaf in jax.tree.leaves(poses)]
         if is_real.ndim != 1 or shapes != [(is_real.size, *shape) for shape in wanted]:

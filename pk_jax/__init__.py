@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from pk_jax.kinematics.forward import forward_kinematics as forward_kinematics
     from pk_jax.kinematics.inverse import InverseKinematics as InverseKinematics
     from pk_jax.kinematics.inverse import inverse_kinematics as inverse_kinematics
+    from pk_jax.kinematics.inverse import working_modes as working_modes
     from pk_jax.kinematics.jacobian import joint_jacobian as joint_jacobian
     from pk_jax.kinematics.jacobian import pose_jacobian as pose_jacobian
     from pk_jax.kinematics.jacobian import velocity_jacobian as velocity_jacobian
@@ -108,6 +109,7 @@ _NAMES = {
     "pk_jax.kinematics.inverse": (
         "InverseKinematics",
         "inverse_kinematics",
+        "working_modes",
     ),
     "pk_jax.kinematics.jacobian": (
         "joint_jacobian",

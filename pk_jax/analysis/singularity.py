@@ -116,14 +116,21 @@ def scaled_rows(
     mech: Mechanism, pose: Any, joints: jax.Array, length: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """A (c, n) and B (c, m) of the rows that carry force: lengths over `length`, [A B] with unit rows."""
+    a, b, size = rows_and_sizes(mech, pose, joints, length)
     rows = slice(mech.actuated_rows)  # sensors lock nothing
-    a, b = pose_jacobian(mech, pose, joints)[rows], joint_jacobian(mech, pose, joints)[rows]
+    return a[rows] / size[rows, None], b[rows] / size[rows, None]
+
+
+def rows_and_sizes(
+    mech: Mechanism, pose: Any, joints: jax.Array, length: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """A (c, n) and B (c, m) with lengths over `length`, and the size of each row of [A B] (c,), 1 for 0."""
+    a, b = pose_jacobian(mech, pose, joints), joint_jacobian(mech, pose, joints)
     a = a * length ** units(pose_units(pose, mech.pose_units), a.dtype)
     b = b * length ** units(mech.joint_units or (1,) * b.shape[1], b.dtype)
-    squared = jnp.sum(a * a, axis=1, keepdims=True) + jnp.sum(b * b, axis=1, keepdims=True)
+    squared = jnp.sum(a * a, axis=1) + jnp.sum(b * b, axis=1)
     is_zero = squared == 0
-    size = jnp.where(is_zero, 1, jnp.sqrt(jnp.where(is_zero, 1, squared)))
-    return a / size, b / size
+    return a, b, jnp.where(is_zero, 1, jnp.sqrt(jnp.where(is_zero, 1, squared)))
 
 
 def _openness(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:

@@ -83,7 +83,11 @@ def branch_shape(mech: Mechanism) -> jax.ShapeDtypeStruct:
 
 
 def working_modes(mech: Mechanism) -> np.ndarray:
-    """Every working mode, the default one first; one row of no signs where there is one. -> (2^s, s)"""
+    """Every working mode of the closed form as signs for `branch`, the default one first. -> (2^s, s)
+
+    One row of no signs where there is a single mode.
+    """
+    require_mechanism("working_modes", mech)
     shape = jax.eval_shape(lambda mech: mech.default_branch(), mech)
     if shape is None:
         return np.zeros((1, 0))

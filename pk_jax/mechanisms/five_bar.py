@@ -22,6 +22,9 @@ class FiveBar(LegMechanism):
     joint to the end point that may be used (default: |lb - la| and la + lb, all that the links reach).
     Pose (x, y), joints (phi1, phi2), absolute angles of the driven links.
 
+    It is also the 5-link of the screw analysis of planar parallel robots, which counts the leg at
+    -half_base first: its screws are the lines through the distal links (eqs. 20-24 there).
+
     Working mode: branch_i = sign(sin psi_i), psi_i the angle from the proximal to the distal link
     of leg i; the default (+1, -1) has both elbows outside.
 

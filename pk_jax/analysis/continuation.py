@@ -5,8 +5,8 @@ joint rates with B v = 0 (type I). Together with the closure equations,
 
     F(x(a), q) = 0,  A v = 0 (or B v = 0),  |v| = 1,
 
-is a system for square and redundant mechanisms alike, and it has no signs to change: zeros that a determinant only
-touches are found like all others.
+is a system for square and redundant mechanisms alike, and it has no signs to change: zeros that a determinant
+only touches are found like all others.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ def _matrix(mech: Mechanism, pose: Any, joints: jax.Array, length: jax.Array, ki
 def _system(
     mech: Mechanism, at: Any, length: jax.Array, scale: jax.Array, problem: Problem, y: jax.Array
 ) -> jax.Array:
-    """What a singular configuration fulfils, in scaled variables y = (coordinates, joints, motion) / scale."""
+    """What a singular configuration fulfils; y = (coordinates, joints, motion) / scale."""
     d, m = len(problem.axes), problem.joints
     values, joints, motion = jnp.split(y * scale, (d, d + m))
     pose = pose_on(at, problem.axes, values)

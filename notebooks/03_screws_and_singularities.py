@@ -342,7 +342,8 @@ viz.draw_locus(five, locus, unit="m")
 #
 # Sauer's 3-RPR with legs of 5, 7 and 3 has six assembly modes. Each has its own $\varphi$, hence its own
 # slice of the locus; at a fixed $\varphi$ that is a conic. The sign of $\det A$ says on which side of it
-# a mode lies, and as real solutions of this system come and go in pairs of opposite sign, three lie on each.
+# a mode lies, and as real solutions of this system come and go in pairs of opposite sign, three lie on each. Three
+# of them are drawn.
 
 # %%
 sauer, legs = pk.catalogued("sauer-3-rpr"), jnp.array([5.0, 7.0, 3.0])
@@ -361,9 +362,10 @@ assert is_real.all() and np.abs(left_over).max() < 1e-10
 signs = np.sign(det).astype(int).tolist()
 assert sum(signs) == 0
 
-figure = Figure(figsize=(9.5, 6.4), layout="compressed")
+figure = Figure(figsize=(9.5, 3.6), layout="compressed")
 worst = 0.0
-for ax, mode, sign in zip(figure.subplots(2, 3, sharex=True, sharey=True).flat, modes, signs, strict=True):
+shown = slice(0, 3)
+for ax, mode, sign in zip(figure.subplots(1, 3, sharey=True), modes[shown], signs[shown], strict=True):
     slice_ = pk.singularity_locus(sauer, at=mode, ranges=((-8, 8), (-6, 10)), kinds="II", nodes=21)
     points = np.concatenate([curve.coordinates for curve in slice_.curves]) / 8
     x, y = points.T

@@ -394,6 +394,7 @@ def test_curves_that_cross_are_found_on_both_sides():
     assert np.max(off) <= 1e-9
 
 
+@pytest.mark.soak
 def test_a_coaxial_five_bar_is_singular_everywhere_with_equal_elbows():
     found = pk.singularity_locus(pk.FiveBar(half_base=0.0, proximal=0.3, distal=0.2), nodes=41)
     modes = {tuple(int(sign) for sign in mode) for kind, mode in found.everywhere if kind == TWO}
@@ -454,6 +455,7 @@ def test_three_axes_are_for_redundant_robots():
     assert said.startswith("axes must be two") and "PlanarRRR" in said
 
 
+@pytest.mark.soak
 def test_the_six_link_has_only_the_circles_of_its_arms():
     mech = pk.catalogued("6-link")
     found = pk.singularity_locus(mech, nodes=25)
@@ -473,7 +475,8 @@ def test_the_six_link_has_only_the_circles_of_its_arms():
 # ---------------------------------------------------------------- in space
 
 
-@pytest.mark.parametrize("sensors", [0, pytest.param(3, marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize("sensors", [0, 3])
 def test_yaw_of_90_degrees_of_a_semi_regular_platform(sensors):
     """Fichter: six legs; more rows are sensors and carry nothing."""
     semi = pk.catalogued("semi-regular-stewart")
@@ -494,6 +497,7 @@ def test_yaw_of_90_degrees_of_a_semi_regular_platform(sensors):
     assert np.all(np.abs(np.diff(curve.coordinates[[0, -1], 0])) > 0.6 - 0.01) and len(turn) > 20
 
 
+@pytest.mark.soak
 def test_type_one_of_a_mechanism_without_a_closed_form():
     """An arm of the Delta is stretched or folded in line with its rod, seen along its axis."""
     mech = delta()

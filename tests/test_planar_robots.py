@@ -134,6 +134,7 @@ def test_every_working_mode_closes_the_loops_and_comes_back(build):
     np.testing.assert_allclose(np.asarray(back.pose)[is_ok], poses[is_ok], rtol=0, atol=1e-11)
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("build", [*ARMED.values(), lambda: legs(3)], ids=[*ARMED, "3-rpr"])
 def test_forward_of_inverse_is_the_identity_in_a_box(build):
     mech = build()

@@ -150,7 +150,13 @@ def delta_joints(mech, pose):
     return np.arctan2(-z, along) - np.arccos(c / size)
 
 
-@pytest.mark.parametrize(("make", "middle", "to_side"), ROBOTS.values(), ids=ROBOTS.keys())
+ORACLES = [
+    pytest.param(*robot, id=name, marks=[pytest.mark.soak] if name in ("Stewart", "3-RPR") else [])
+    for name, robot in ROBOTS.items()
+]
+
+
+@pytest.mark.parametrize(("make", "middle", "to_side"), ORACLES)
 def test_regular_poses_against_the_null_space(make, middle, to_side):
     mech = make()
     pose, joints = random_rows(mech, middle, to_side, 1000)

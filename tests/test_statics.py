@@ -661,6 +661,7 @@ def parallel(legs):
 # ---------------------------------------------------------------- batches, jit, grad
 
 
+@pytest.mark.soak
 def test_a_batch_equals_a_loop():
     mech = FORCES["6-link"]()
     pose, joints, _, wrench, tau = jax.tree.map(lambda leaf: leaf[:3], some(mech))

@@ -342,8 +342,8 @@ viz.draw_locus(five, locus, unit="m")
 #
 # Sauer's 3-RPR with legs of 5, 7 and 3 has six assembly modes. Each has its own $\varphi$, hence its own
 # slice of the locus; at a fixed $\varphi$ that is a conic. The sign of $\det A$ says on which side of it
-# a mode lies, and as real solutions of this system come and go in pairs of opposite sign, three lie on each. Three
-# of them are drawn.
+# a mode lies, and as real solutions of this system come and go in pairs of opposite sign, three lie on each.
+# Three of them are drawn.
 
 # %%
 sauer, legs = pk.catalogued("sauer-3-rpr"), jnp.array([5.0, 7.0, 3.0])

@@ -492,6 +492,12 @@ def test_bounds_where_nothing_can_be_chosen():
     assert found.status == pk.Status.OK
     found = pk.bounded_joint_forces(SEMI, pose, joints, weight, 0, 0.5 * np.max(forces))
     assert found.status == pk.Status.UNREACHABLE and np.all(np.isnan(found.forces))
+    wrenches = np.stack([weight, NAN * weight, -weight])
+    poses = pk.SE3(*(np.tile(leaf, (3,) + (1,) * leaf.ndim) for leaf in (pose.translation, pose.rotation)))
+    found = pk.bounded_joint_forces(SEMI, poses, np.tile(joints, (3, 1)), wrenches, -1, 1)
+    assert [pk.Status(s).name for s in found.status] == ["OK", "BAD_INPUT", "OK"]
+    close(found.forces[0], forces)
+    close(found.forces[2], -forces)
 
 
 def test_too_many_preloads_for_bounds_are_refused():

@@ -19,7 +19,7 @@ import numpy as np
 from pk_jax import checks
 from pk_jax.geometry import safe
 from pk_jax.geometry.poses import pose_units, tangent_size
-from pk_jax.kinematics.batching import configurations, home_shapes, over_rows, rows_of
+from pk_jax.kinematics.batching import all_finite, configurations, home_shapes, over_rows, rows_of
 from pk_jax.kinematics.blocks import joint_blocks
 from pk_jax.kinematics.jacobian import SINGULAR_BELOW, joint_jacobian, pose_jacobian, scaled_jacobians, units
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
@@ -44,7 +44,7 @@ def screws(mech: Mechanism, pose: Any, joints: Any) -> Screws:
     space, the moment taken about the platform's origin; its force is a unit vector, and a pure couple
     has moment length(). Each is reciprocal to every joint but its own, the other motors of its leg
     included. The arm of a telescopic leg is 1, that of a driven revolute joint its distance
-    from the line, la sin(psi).
+    from the line, la sin(psi). NaN where the line is none (the tip of a 6-link's arm on its first joint).
 
     Where a leg is stretched or folded (type I) its arms are 0 and its lines what they tend to.
     The sign: a line points from the base to the platform in legs whose equation grows with the distance
@@ -106,7 +106,7 @@ class BoundedForces(NamedTuple):
     """Joint forces within bounds, batch first."""
 
     forces: jax.Array  # (m,) NaN unless the status is OK
-    status: jax.Array  # () Status: OK; UNREACHABLE: no forces within the bounds exert the wrench; SINGULAR
+    status: jax.Array  # () Status: OK; UNREACHABLE: no forces within the bounds do it; SINGULAR; BAD_INPUT
 
 
 def bounded_joint_forces(
@@ -272,5 +272,7 @@ def _bounded(
     best = jnp.argmin(jnp.where(fits, jnp.sum(tried**2, axis=1), jnp.inf))
     is_good = jnp.any(fits) & ~singular
     status = jnp.where(singular, Status.SINGULAR, jnp.where(is_good, Status.OK, Status.UNREACHABLE))
+    is_given = all_finite(pose, joints, wrench) & ~jnp.any(jnp.isnan(lower) | jnp.isnan(upper))
+    status = jnp.where(is_given, status, Status.BAD_INPUT)
     forces = jnp.where(is_good, jnp.clip(tried[best], lower, upper), jnp.nan)
     return BoundedForces(forces, status.astype(jnp.int32))

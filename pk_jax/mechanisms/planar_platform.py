@@ -21,6 +21,46 @@ _TURNS = np.deg2rad([15.0 * (-1) ** k * ((k + 1) // 2) for k in range(24)])  # 0
 _ASIDE = np.array([[0.0, 0.0], [0.5, 0.3], [-0.4, 0.5], [0.1, -0.6]])  # of the length
 
 
+class PlanarPlatform(LegMechanism):
+    """A platform (x, y, phi) held at `platform` (k, 2), in its frame, by legs that stand at `base` (k, 2)."""
+
+    base: jax.Array
+    platform: jax.Array
+
+    pose_units = (1, 1, 0)
+
+    def attachments(self) -> jax.Array:
+        return self.platform
+
+    def length(self) -> jax.Array:
+        """Root mean square distance of the platform joints from their centroid."""
+        return platform_radius(self.platform)
+
+
+class ArmedPlatform(PlanarPlatform):
+    """Its legs are arms of two links, `proximal` and `distal`, () or (k,)."""
+
+    proximal: jax.Array
+    distal: jax.Array
+
+    def limits(self) -> tuple[jax.Array, jax.Array]:
+        """Least and greatest distance from the base joint to the platform joint of each arm. -> (k,), (k,)"""
+        each = jnp.zeros(self.base.shape[0], self.base.dtype)
+        return each + jnp.abs(self.distal - self.proximal), each + self.proximal + self.distal
+
+    def links(self) -> dict[str, jax.Array]:
+        return {"proximal": self.proximal, "distal": self.distal}
+
+    def margins(self, pose: jax.Array, joints: jax.Array) -> dict[str, jax.Array]:
+        """How far the arms are from folded and from stretched, over length(). Each (k,)."""
+        nearest, farthest = self.limits()
+        distance = safe.norm(place(pose, self.platform) - self.base)
+        return {
+            "reach_min": (distance - nearest) / self.length(),
+            "reach_max": (farthest - distance) / self.length(),
+        }
+
+
 def best_home(
     base: jax.Array,
     platform: jax.Array,

@@ -12,10 +12,10 @@ from pk_jax.geometry import safe
 from pk_jax.geometry.circles import platforms_on_circles
 from pk_jax.geometry.poses import place
 from pk_jax.mechanisms import planar_platform
-from pk_jax.mechanisms.base import LegMechanism, Skeleton
+from pk_jax.mechanisms.base import Skeleton
 
 
-class PlanarRPR(LegMechanism):
+class PlanarRPR(planar_platform.PlanarPlatform):
     """k leg lengths drive a platform (x, y, phi): the 3-RPR, the planar Stewart platform, and k > 3.
 
     Fields, in one unit of length: base (k, 2); platform (k, 2) in the platform frame; optional stroke
@@ -26,11 +26,8 @@ class PlanarRPR(LegMechanism):
     degree 6 of its assembly modes.
     """
 
-    base: jax.Array
-    platform: jax.Array
     stroke: jax.Array | None = None
 
-    pose_units = (1, 1, 0)
     joints_are_distances = True
 
     def check_shapes(self) -> None:
@@ -60,9 +57,6 @@ class PlanarRPR(LegMechanism):
             return each + 0.1 * size, each + 2 * size
         return each + self.stroke[..., 0], each + self.stroke[..., 1]
 
-    def attachments(self) -> jax.Array:
-        return self.platform
-
     def legs(self, points: jax.Array, joints: jax.Array) -> jax.Array:
         """(|leg|^2 - l^2) / 2."""
         return (jnp.sum((points - self.base) ** 2, axis=-1) - joints**2) / 2
@@ -71,10 +65,6 @@ class PlanarRPR(LegMechanism):
         """Over the middle of the base and unturned, unless that is far closer to a singularity."""
         pose = _best_home(self)[0]
         return pose, self.inverse(pose)
-
-    def length(self) -> jax.Array:
-        """Root mean square distance of the platform joints from their centroid."""
-        return planar_platform.platform_radius(self.platform)
 
     def margins(self, pose: jax.Array, joints: jax.Array) -> dict[str, jax.Array]:
         """Strokes over length(), where they are given. Each (k,)."""

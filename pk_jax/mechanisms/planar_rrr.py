@@ -7,15 +7,14 @@ import jax.numpy as jnp
 from jax import lax
 
 from pk_jax import checks
-from pk_jax.geometry import safe
 from pk_jax.geometry.circles import platforms_on_circles
 from pk_jax.geometry.planar import arm_angles, cross, direction
 from pk_jax.geometry.poses import place
 from pk_jax.mechanisms import planar_platform
-from pk_jax.mechanisms.base import LegMechanism, Skeleton
+from pk_jax.mechanisms.base import Skeleton
 
 
-class PlanarRRR(LegMechanism):
+class PlanarRRR(planar_platform.ArmedPlatform):
     """k angles drive a platform (x, y, phi): 3-RRR with k = 3, redundantly actuated with more (4-RRR).
 
     Fields, in one unit of length: base (k, 2) the driven joints; platform (k, 2) the platform joints in
@@ -30,13 +29,7 @@ class PlanarRRR(LegMechanism):
     driven joint la sin psi_i.
     """
 
-    base: jax.Array
-    platform: jax.Array
-    proximal: jax.Array
-    distal: jax.Array
-
     joint_units = property(lambda self: (0,) * self.base.shape[0])
-    pose_units = (1, 1, 0)
 
     def check_shapes(self) -> None:
         checks.has_shape("PlanarRRR.base", self.base, (None, 2))
@@ -44,30 +37,19 @@ class PlanarRRR(LegMechanism):
         if rows < 3:
             raise ValueError(f"PlanarRRR.base must have three rows (arms) or more, got {rows}")
         checks.has_shape("PlanarRRR.platform", self.platform, (rows, 2))
-        planar_platform.check_lengths("PlanarRRR", self._links(), rows)
+        planar_platform.check_lengths("PlanarRRR", self.links(), rows)
 
     def check_values(self) -> None:
-        planar_platform.check_positive("PlanarRRR", self._links())
+        planar_platform.check_positive("PlanarRRR", self.links())
         planar_platform.check_ends("PlanarRRR", self.base, self.platform)
         planar_platform.check_home("PlanarRRR", _best_home(self)[1], "proximal and distal")
-
-    def _links(self) -> dict[str, jax.Array]:
-        return {"proximal": self.proximal, "distal": self.distal}
 
     def default_branch(self) -> jax.Array:
         return jnp.ones(self.base.shape[0], self.base.dtype)
 
-    def limits(self) -> tuple[jax.Array, jax.Array]:
-        """Least and greatest distance from the base joint to the platform joint of each arm. -> (k,), (k,)"""
-        each = jnp.zeros(self.base.shape[0], self.base.dtype)
-        return each + jnp.abs(self.distal - self.proximal), each + self.proximal + self.distal
-
     def elbows(self, joints: jax.Array) -> jax.Array:
         """Where the proximal links end. -> (k, 2)"""
         return self.base + (self.proximal * direction(joints).T).T
-
-    def attachments(self) -> jax.Array:
-        return self.platform
 
     def legs(self, points: jax.Array, joints: jax.Array) -> jax.Array:
         """(|distal link|^2 - lb^2) / 2."""
@@ -77,19 +59,6 @@ class PlanarRRR(LegMechanism):
         """Over the middle of the base and unturned, unless that is far closer to a singularity."""
         pose = _best_home(self)[0]
         return pose, self.inverse(pose)
-
-    def length(self) -> jax.Array:
-        """Root mean square distance of the platform joints from their centroid."""
-        return planar_platform.platform_radius(self.platform)
-
-    def margins(self, pose: jax.Array, joints: jax.Array) -> dict[str, jax.Array]:
-        """How far the arms are from folded and from stretched, over length(). Each (k,)."""
-        nearest, farthest = self.limits()
-        distance = safe.norm(place(pose, self.platform) - self.base)
-        return {
-            "reach_min": (distance - nearest) / self.length(),
-            "reach_max": (farthest - distance) / self.length(),
-        }
 
     def skeleton(self, pose: jax.Array, joints: jax.Array) -> Skeleton:
         k = self.base.shape[0]

@@ -11,12 +11,12 @@ from pk_jax.geometry import safe
 from pk_jax.geometry.planar import arm_angles, cross, direction, quarter_turn
 from pk_jax.geometry.poses import place
 from pk_jax.mechanisms import planar_platform
-from pk_jax.mechanisms.base import LegMechanism, Skeleton
+from pk_jax.mechanisms.base import Skeleton
 
 ELBOWS_OUT = (-1.0, 1.0)  # with the first arm on the left
 
 
-class SixLink(LegMechanism):
+class SixLink(planar_platform.ArmedPlatform):
     """Four angles drive a platform (x, y, phi) of three freedoms: the redundant 6-link A-B-C-D-E-F.
 
     Fields, in one unit of length, row 1 the arm A-B-C, row 2 the arm F-E-D: base (2, 2) the joints A and
@@ -31,34 +31,20 @@ class SixLink(LegMechanism):
     paper's direct singularity, all screws on one line, is none: locked motors hold C and D.
     """
 
-    base: jax.Array
-    platform: jax.Array
-    proximal: jax.Array
-    distal: jax.Array
-
     joint_units = (0, 0, 0, 0)
-    pose_units = (1, 1, 0)
 
     def check_shapes(self) -> None:
         for name in ("base", "platform"):
             checks.has_shape(f"SixLink.{name}", getattr(self, name), (2, 2))
-        planar_platform.check_lengths("SixLink", self._links(), 2)
+        planar_platform.check_lengths("SixLink", self.links(), 2)
 
     def check_values(self) -> None:
-        planar_platform.check_positive("SixLink", self._links())
+        planar_platform.check_positive("SixLink", self.links())
         planar_platform.check_ends("SixLink", self.base, self.platform)
         planar_platform.check_home("SixLink", _best_home(self)[1], "proximal and distal")
 
-    def _links(self) -> dict[str, jax.Array]:
-        return {"proximal": self.proximal, "distal": self.distal}
-
     def default_branch(self) -> jax.Array:
         return jnp.asarray(ELBOWS_OUT, self.base.dtype)
-
-    def limits(self) -> tuple[jax.Array, jax.Array]:
-        """Least and greatest distance from the base joint to the platform joint of each arm. -> (2,), (2,)"""
-        each = jnp.zeros(2, self.base.dtype)
-        return each + jnp.abs(self.distal - self.proximal), each + self.proximal + self.distal
 
     def elbows(self, joints: jax.Array) -> jax.Array:
         """B and E. -> (2, 2)"""
@@ -68,9 +54,6 @@ class SixLink(LegMechanism):
         """Where the motors hold C and D. -> (2, 2)"""
         return self.elbows(joints) + (self.distal * direction(joints[::2] + joints[1::2]).T).T
 
-    def attachments(self) -> jax.Array:
-        return self.platform
-
     def legs(self, points: jax.Array, joints: jax.Array) -> jax.Array:
         """Platform joint less the tip of its arm. -> (2, 2)"""
         return points - self.tips(joints)
@@ -79,19 +62,6 @@ class SixLink(LegMechanism):
         """On the left of the way from A to F and unturned, unless other poses bend the arms far better."""
         pose = _best_home(self)[0]
         return pose, self.inverse(pose)
-
-    def length(self) -> jax.Array:
-        """Half the distance from C to D."""
-        return planar_platform.platform_radius(self.platform)
-
-    def margins(self, pose: jax.Array, joints: jax.Array) -> dict[str, jax.Array]:
-        """How far the arms are from folded and from stretched, over length(). Each (2,)."""
-        nearest, farthest = self.limits()
-        distance = safe.norm(place(pose, self.platform) - self.base)
-        return {
-            "reach_min": (distance - nearest) / self.length(),
-            "reach_max": (farthest - distance) / self.length(),
-        }
 
     def skeleton(self, pose: jax.Array, joints: jax.Array) -> Skeleton:
         points = [self.base, self.elbows(joints), place(pose, self.platform), pose[None, :2]]

@@ -1,5 +1,6 @@
 """Screws and statics: lines by construction, the power balance, published stiffness, and what is refused."""
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -30,12 +31,14 @@ def said_by(call, *arguments, **named):
 # ---------------------------------------------------------------- mechanisms and poses
 
 
+def _names(kind):
+    return [field.name for field in dataclasses.fields(kind)]
+
+
 def unchecked(kind, **fields):
     """A mechanism without the checks at the door, which compile the search for a home."""
     tree = jax.tree.structure(jax.eval_shape(lambda fields: kind(**fields), fields))
-    return jax.tree.unflatten(
-        tree, [jnp.asarray(fields[name]) for name in kind.__annotations__ if name in fields]
-    )
+    return jax.tree.unflatten(tree, [jnp.asarray(fields[name]) for name in _names(kind) if name in fields])
 
 
 def five_bar(rng):

@@ -19,7 +19,6 @@ import numpy as np
 
 import pk_jax as pk
 from benchmarks.bench_forward_kinematics import best_of, naive
-from pk_jax.kinematics.inverse import working_modes
 
 ROWS = 16_384
 
@@ -142,7 +141,7 @@ def numpy_contours(robot: pk.PlanarRRR, lines: list[np.ndarray], nodes: int) -> 
         leg = at + platform - base
         squared = np.sum(leg**2, axis=-1)
         bend = np.arccos((squared - la**2 - lb**2) / (2 * la * lb))  # psi, NaN out of reach
-        for mode in working_modes(robot):
+        for mode in pk.working_modes(robot):
             psi = mode * bend
             joints = np.arctan2(leg[..., 1], leg[..., 0]) - np.arctan2(
                 lb * np.sin(psi), la + lb * np.cos(psi)
@@ -159,7 +158,7 @@ def numpy_contours(robot: pk.PlanarRRR, lines: list[np.ndarray], nodes: int) -> 
 def exactness(robot: pk.PlanarRRR, vertices: list[np.ndarray]) -> np.ndarray:
     """sigma of the points of a contour that are in reach."""
     found = []
-    for mode, points in zip(working_modes(robot), vertices, strict=True):
+    for mode, points in zip(pk.working_modes(robot), vertices, strict=True):
         if len(points):
             poses = np.column_stack([points, np.zeros(len(points))])
             joints = pk.inverse_kinematics(robot, poses, mode).candidate

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import outsiders
 import pytest
+from refusals import said_by
 from scipy.spatial.transform import Rotation
 
 import pk_jax as pk
@@ -19,14 +20,6 @@ named = lambda cases: [f"{case.figure} {case.title}" for case in cases]
 CASE = {case.title: case for case in CASES}
 SEMI = pk.catalogued("semi-regular-stewart")
 sigmas = lambda found: np.stack([np.asarray(value) for value in found[1:4]])
-
-
-def said_by(call, *arguments, **named):
-    with pytest.raises(ValueError) as caught:
-        call(*arguments, **named)
-    said = str(caught.value)
-    assert "\n" not in said
-    return said
 
 
 def classified(case, **named):

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import outsiders
 import pytest
+from refusals import said_by
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
@@ -18,14 +19,6 @@ from pk_jax.papers.planar_screws import geometric_screws, singular_cases
 
 NAN, INF = np.nan, np.inf
 ROWS = 32
-
-
-def said_by(call, *arguments, **named):
-    with pytest.raises(ValueError) as caught:
-        call(*arguments, **named)
-    said = str(caught.value)
-    assert "\n" not in said
-    return said
 
 
 # ---------------------------------------------------------------- mechanisms and poses

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusals import said_by
 from scipy.spatial.transform import Rotation
 
 import pk_jax as pk
@@ -13,14 +14,6 @@ from pk_jax.mechanisms.catalogue import CATALOGUE
 
 SEMI = pk.catalogued("semi-regular-stewart")
 NAN = np.nan
-
-
-def said_by(call, *arguments, **named):
-    with pytest.raises(ValueError) as caught:
-        call(*arguments, **named)
-    said = str(caught.value)
-    assert "\n" not in said
-    return said
 
 
 def some_poses(count, reach=1.0):

@@ -74,6 +74,7 @@ def classify_singularity(
     """
     require_mechanism("classify_singularity", mech)
     rows, are_batched = configurations(mech, pose, joints)
+    checks.has_shape("tol", checks.real_array("tol", tol), ())
     if checks.is_concrete(tol) and not 0 < float(tol) < 1:
         raise ValueError(f"tol must be in (0, 1), got {tol}")
     size = _length(mech, length)

@@ -44,7 +44,7 @@ def classified_text(found: dict[str, Any]) -> str:
     lines = [
         f"pose: {show(found['pose'])}  ({unit})",
         f"joints: {show(found['joints'])}  ({unit})",
-        f"\n{found['kind']}, lengths measured in {found['length']:.6g} m",
+        f"\n{found['kind']}, lengths measured in {found['length']:.6g}{'' if found['unit'] == '1' else ' m'}",
         f"distance to type I (inverse)   {found['sigma_inverse']:.6g}",
         f"distance to type II (direct)   {found['sigma_direct']:.6g}",
         f"independence of the equations  {found['sigma_configuration']:.6g}",
@@ -74,9 +74,8 @@ def locus_of(
     if given:
         if set(given) != set(chosen or ()):
             raise ValueError(f"--range must be given for each of --axes {','.join(chosen)}, or for none")
-        lengths = named.metres if named.unit != "1" else 1.0
         box = [
-            [v * (1.0 if name in ("phi", "rx", "ry", "rz") else lengths) for v in given[name]]
+            [v * (1.0 if name in ("phi", "rx", "ry", "rz") else named.metres) for v in given[name]]
             for name in chosen
         ]
     return singularity_locus(

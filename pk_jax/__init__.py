@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from pk_jax.design.variables import design_space as design_space
     from pk_jax.files.mechanism_file import load_mechanism as load_mechanism
     from pk_jax.files.mechanism_file import save_mechanism as save_mechanism
+    from pk_jax.geometry.axis_pose import AxisPose as AxisPose
     from pk_jax.geometry.se3 import SE3 as SE3
     from pk_jax.kinematics.forward import ForwardKinematics as ForwardKinematics
     from pk_jax.kinematics.forward import forward_kinematics as forward_kinematics
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from pk_jax.mechanisms.base import LegMechanism as LegMechanism
     from pk_jax.mechanisms.base import Mechanism as Mechanism
     from pk_jax.mechanisms.base import Skeleton as Skeleton
+    from pk_jax.mechanisms.casing_oscillator import CasingOscillator as CasingOscillator
     from pk_jax.mechanisms.catalogue import catalogued as catalogued
     from pk_jax.mechanisms.five_bar import FiveBar as FiveBar
     from pk_jax.mechanisms.planar_rpr import PlanarRPR as PlanarRPR
@@ -101,6 +103,7 @@ _NAMES = {
         "load_mechanism",
         "save_mechanism",
     ),
+    "pk_jax.geometry.axis_pose": ("AxisPose",),
     "pk_jax.geometry.se3": ("SE3",),
     "pk_jax.kinematics.forward": (
         "ForwardKinematics",
@@ -136,6 +139,7 @@ _NAMES = {
         "Mechanism",
         "Skeleton",
     ),
+    "pk_jax.mechanisms.casing_oscillator": ("CasingOscillator",),
     "pk_jax.mechanisms.catalogue": ("catalogued",),
     "pk_jax.mechanisms.five_bar": ("FiveBar",),
     "pk_jax.mechanisms.planar_rpr": ("PlanarRPR",),

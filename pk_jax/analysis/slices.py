@@ -13,7 +13,8 @@ import numpy as np
 
 from pk_jax import checks
 from pk_jax.geometry import rotations
-from pk_jax.geometry.poses import pose_units, position, tangent_size
+from pk_jax.geometry.axis_pose import AxisPose
+from pk_jax.geometry.poses import Turning, like, pose_units, position, tangent_size
 from pk_jax.geometry.se3 import SE3
 from pk_jax.kinematics.batching import all_finite, home_shapes, rows_of
 from pk_jax.kinematics.in_blocks import padded
@@ -21,16 +22,20 @@ from pk_jax.kinematics.inverse import inverse_kinematics, working_modes
 from pk_jax.mechanisms.base import Mechanism
 
 SPACE = ("x", "y", "z", "rx", "ry", "rz")
+ABOUT_AN_AXIS = ("s", "roll", "pitch", "yaw")
 BLOCK = 2048  # poses solved at a time
 COARSE = 32  # nodes along each axis when the reach is sought
 FAR = 4  # times the size of the mechanism: where the reach is sought
 
 
 def coordinate_names(mech: Mechanism) -> tuple[str, ...]:
-    """Names of the coordinates of a pose: x, y, z of its position, rx, ry, rz of a turn from it, phi."""
+    """Names of the coordinates of a pose: x, y, z of its position, rx, ry, rz of a turn from it, phi.
+
+    Of an `AxisPose` they are its slide s and its angles roll, pitch, yaw.
+    """
     pose = home_shapes(mech)[0]
-    if isinstance(pose, SE3):
-        return SPACE
+    if isinstance(pose, Turning):
+        return SPACE if isinstance(pose, SE3) else ABOUT_AN_AXIS
     unit = pose_units(pose, mech.pose_units)
     if unit == (1, 1, 0):
         return ("x", "y", "phi")
@@ -62,11 +67,14 @@ class Slice(NamedTuple):
 def pose_on(at: Any, axes: tuple[int, ...], values: jax.Array) -> Any:
     """`at` with some coordinates replaced; turns of an `SE3` are rotation vectors counted from it."""
     axes = np.array(axes)
+    if isinstance(at, AxisPose):
+        all_four = jnp.append(at.s, rotations.to_angles(at.rotation)).at[axes].set(values)
+        return like(at, all_four[0], rotations.from_angles(all_four[1:]))
     if not isinstance(at, SE3):
         return at.at[axes].set(values)
     all_six = jnp.concatenate([at.translation, jnp.zeros_like(at.translation)]).at[axes].set(values)
     turn = rotations.from_rotation_vector(all_six[3:])
-    return jax.tree.unflatten(jax.tree.structure(at), (all_six[:3], turn @ at.rotation))
+    return like(at, all_six[:3], turn @ at.rotation)
 
 
 @partial(jax.jit, static_argnums=1)
@@ -140,7 +148,7 @@ def _reach(mech: Mechanism, found: Slice) -> tuple[np.ndarray, np.ndarray]:
     home, joints = mech.home()
     is_joint_length = np.asarray(mech.joint_units or (1,) * len(joints), bool)
     size = float(mech.length()) + np.max(np.abs(np.asarray(joints))[is_joint_length], initial=0.0)
-    centre = np.append(np.asarray(position(home)), np.zeros(3))[list(found.axes)]
+    centre = np.append(np.asarray(position(home)), np.zeros(3))[list(found.axes)]  # no angle at home
     is_length = np.asarray(found.units, bool)
     box = lambda half: (np.where(is_length, centre - half, -np.pi), np.where(is_length, centre + half, np.pi))
     half = np.full(len(centre), FAR * size)

@@ -30,6 +30,7 @@ import numpy as np
 from pk_jax import checks
 from pk_jax.files.atomic import write_atomically
 from pk_jax.mechanisms.base import Mechanism
+from pk_jax.mechanisms.casing_oscillator import CasingOscillator
 from pk_jax.mechanisms.five_bar import FiveBar
 from pk_jax.mechanisms.planar_rpr import PlanarRPR
 from pk_jax.mechanisms.planar_rrr import PlanarRRR
@@ -38,7 +39,8 @@ from pk_jax.mechanisms.stewart import Stewart
 from pk_jax.mechanisms.two_rpr import TwoRPR
 
 FAMILIES: dict[str, type[Mechanism]] = {
-    family.__name__: family for family in (Stewart, PlanarRRR, PlanarRPR, SixLink, FiveBar, TwoRPR)
+    family.__name__: family
+    for family in (Stewart, CasingOscillator, PlanarRRR, PlanarRPR, SixLink, FiveBar, TwoRPR)
 }
 UNITS = {  # metres; "1" is for lengths over a length of reference
     "m": Decimal(1),

@@ -14,6 +14,8 @@ from pk_jax.analysis.slices import coordinate_names
 from pk_jax.files.named import Named
 from pk_jax.files.rows_file import format_rows
 from pk_jax.files.stream import joint_layouts, joints_columns, output_layout, pose_columns
+from pk_jax.geometry.poses import pose_units
+from pk_jax.kinematics.batching import home_shapes
 from pk_jax.kinematics.statics import screws
 
 
@@ -74,10 +76,8 @@ def locus_of(
     if given:
         if set(given) != set(chosen or ()):
             raise ValueError(f"--range must be given for each of --axes {','.join(chosen)}, or for none")
-        box = [
-            [v * (1.0 if name in ("phi", "rx", "ry", "rz") else named.metres) for v in given[name]]
-            for name in chosen
-        ]
+        units = dict(zip(names, pose_units(home_shapes(mech)[0], mech.pose_units), strict=True))
+        box = [[v * (named.metres if units[name] else 1.0) for v in given[name]] for name in chosen]
     return singularity_locus(
         mech, chosen, at=at, ranges=box, branch=signs_of(branch), kinds=kinds, nodes=nodes, report=report
     )

@@ -20,7 +20,8 @@ from pk_jax.files.columns import Column, Layout
 from pk_jax.files.named import Named
 from pk_jax.files.rows_file import CHUNK, format_rows, open_rows, parse_row
 from pk_jax.geometry import rotations
-from pk_jax.geometry.poses import pose_units
+from pk_jax.geometry.axis_pose import AxisPose
+from pk_jax.geometry.poses import Turning, pose_units, position
 from pk_jax.geometry.se3 import SE3
 from pk_jax.kinematics.batching import home_shapes
 from pk_jax.kinematics.forward import forward_kinematics
@@ -29,7 +30,8 @@ from pk_jax.status import Status
 
 Solve = Callable[[Layout, np.ndarray], tuple[list[Any], np.ndarray]]  # -> columns to write, statuses
 
-_QUATERNION, _VECTOR = ("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_TURN = {SE3: ("rx", "ry", "rz"), AxisPose: ("roll", "pitch", "yaw")}
 _KINDS = ("angle", "length")
 
 
@@ -108,33 +110,35 @@ def _is_same(first: str, second: str) -> bool:
 
 
 def joint_layouts(named: Named) -> list[Layout]:
-    """q1, ..., qm; or l1, ..., lm where all joints are lengths."""
+    """The mechanism's own names of its joints; q1, ..., qm; or l1, ..., lm where all are lengths."""
     units = named.mechanism.joint_units or (1,) * home_shapes(named.mechanism)[1].shape[0]
-    letters = "ql" if all(units) else "q"
-    return [tuple(Column(f"{a}{i}", _KINDS[u]) for i, u in enumerate(units, 1)) for a in letters]
+    names = [[f"{a}{i}" for i in range(1, len(units) + 1)] for a in ("ql" if all(units) else "q")]
+    if named.mechanism.joint_names is not None:
+        names[:] = [named.mechanism.joint_names]
+    return [tuple(Column(name, _KINDS[u]) for name, u in zip(each, units, strict=True)) for each in names]
 
 
 def pose_layouts(named: Named) -> list[Layout]:
-    """Position, then quaternion or rotation vector; or the coordinates of an array pose."""
-    layout = _position(named)
-    if not isinstance(home_shapes(named.mechanism)[0], SE3):
+    """Position, then quaternion or rotation vector (`AxisPose`: angles); or what an array pose holds."""
+    layout, kind = _position(named), type(home_shapes(named.mechanism)[0])
+    if not issubclass(kind, Turning):
         return [layout]
-    return [(*layout, *_numbers(_QUATERNION)), (*layout, *_angles(_VECTOR))]
+    return [(*layout, *_numbers(_QUATERNION)), (*layout, *_angles(_TURN[kind]))]
 
 
 def output_layout(named: Named) -> Layout:
-    if not isinstance(home_shapes(named.mechanism)[0], SE3):
-        return _position(named)
-    return (*_position(named), *_numbers(_QUATERNION), *_angles(_VECTOR))
+    layout, kind = _position(named), type(home_shapes(named.mechanism)[0])
+    if not issubclass(kind, Turning):
+        return layout
+    return (*layout, *_numbers(_QUATERNION), *_angles(_TURN[kind]))
 
 
 def _position(named: Named) -> Layout:
     pose = home_shapes(named.mechanism)[0]
-    if isinstance(pose, SE3):
-        return tuple(Column(name, "length") for name in "xyz")
     units = pose_units(pose, named.mechanism.pose_units)
-    names = coordinate_names(named.mechanism)
-    return tuple(Column(name, _KINDS[u]) for name, u in zip(names, units, strict=True))
+    count = position(pose).shape[0] if isinstance(pose, SE3) else 1 if isinstance(pose, AxisPose) else None
+    named_units = zip(coordinate_names(named.mechanism), units, strict=True)
+    return tuple(Column(name, _KINDS[u]) for name, u in named_units)[:count]
 
 
 def _numbers(names: tuple[str, ...]) -> Layout:
@@ -156,11 +160,11 @@ def pose_of(named: Named, text: str, option: str = "--pose") -> Any:
 
 def pose_columns(named: Named, pose: Any) -> list[np.ndarray]:
     """The numbers of a batch of poses, in the unit of the user."""
-    if not isinstance(pose, SE3):
+    if not isinstance(pose, Turning):
         return [*np.asarray(pose).T / _scale(named, _position(named))[:, None]]
-    quaternion, vector = map(np.asarray, _from_rotation(pose.rotation))
+    quaternion, turn = map(np.asarray, _from_rotation(pose))
     quaternion = np.where(quaternion[:, :1] < 0, -quaternion, quaternion)
-    return [*np.asarray(pose.translation).T / named.metres, *quaternion.T, *vector.T]
+    return [*np.asarray(position(pose)).T / named.metres, *quaternion.T, *turn.T]
 
 
 def joints_columns(named: Named, joints: Any) -> list[np.ndarray]:
@@ -185,22 +189,28 @@ def _inverse(named: Named, pad: _Padding, layout: Layout, rows: np.ndarray) -> t
 
 def _as_pose(named: Named, layout: Layout, rows: np.ndarray) -> Any:
     rows = rows * _scale(named, layout)
-    if not isinstance(home_shapes(named.mechanism)[0], SE3):
+    home = home_shapes(named.mechanism)[0]
+    if not isinstance(home, Turning):
         return rows
-    if len(layout) == 6:
-        return _from_vector(rows[:, :3], rows[:, 3:])
-    size = np.abs(rows[:, 3:]).max(axis=1, keepdims=True)
-    with np.errstate(invalid="ignore"):  # a quaternion of zero length is no rotation: NaN, BAD_INPUT
-        return _from_quaternion(rows[:, :3], rows[:, 3:] / size)
+    place, turn = np.split(rows, [position(home).shape[0]], axis=1)
+    if turn.shape[1] == 4:
+        with np.errstate(invalid="ignore"):  # a quaternion of zero length is no rotation: NaN, BAD_INPUT
+            turn = turn / np.abs(turn).max(axis=1, keepdims=True)
+    return _from_rows(type(home), place, turn)
 
 
-_from_quaternion = jax.jit(SE3.from_quaternion)
-_from_vector = jax.jit(SE3.from_rotation_vector)
+@partial(jax.jit, static_argnums=0)
+def _from_rows(kind: type, place: jax.Array, turn: jax.Array) -> Any:
+    if kind is AxisPose:
+        to_matrix = rotations.from_quaternion if turn.shape[1] == 4 else rotations.from_angles
+        return AxisPose(place[:, 0], jax.vmap(to_matrix)(turn))
+    return (SE3.from_quaternion if turn.shape[1] == 4 else SE3.from_rotation_vector)(place, turn)
 
 
 @jax.jit
-def _from_rotation(rotation: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return jax.vmap(rotations.to_quaternion)(rotation), jax.vmap(rotations.to_rotation_vector)(rotation)
+def _from_rotation(pose: Any) -> tuple[jax.Array, jax.Array]:
+    of_turn = rotations.to_angles if isinstance(pose, AxisPose) else rotations.to_rotation_vector
+    return jax.vmap(rotations.to_quaternion)(pose.rotation), jax.vmap(of_turn)(pose.rotation)
 
 
 def _scale(named: Named, layout: Layout) -> np.ndarray:

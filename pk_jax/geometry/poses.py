@@ -2,7 +2,8 @@
 
 A pose is an array of coordinates, moved by addition: (x, y) and (x, y, z) are translations,
 (x, y, phi) with planar points is a planar rigid motion whose tangent is (x', y', phi'). Or it is
-an `SE3`, moved by a translation and a rotation in base axes. Solvers carry planar rigid motions as
+an `SE3`, moved by a translation and a rotation in base axes, or an `AxisPose`, a rotation and a slide along
+the platform's own axis. Solvers carry planar rigid motions as
 `Turned`, which moves without a cosine.
 """
 
@@ -13,11 +14,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from pk_jax.geometry.axis_pose import AxisPose
 from pk_jax.geometry.planar import cross, direction, rotation, turn_onto
 from pk_jax.geometry.rotations import cayley
 from pk_jax.geometry.se3 import ORTHONORMAL_TO, SE3
 
-Pose = Any  # jax.Array or SE3; inside of solvers also Turned
+Pose = Any  # jax.Array, SE3 or AxisPose; inside of solvers also Turned
+Turning = SE3 | AxisPose  # with a rotation matrix
 
 
 class Turned(NamedTuple):
@@ -40,7 +43,7 @@ def unturned(pose: Turned, near: jax.Array) -> jax.Array:
 
 def is_pose(pose: Pose) -> jax.Array:
     """() False where a rotation is not orthonormal or a reflection."""
-    if not isinstance(pose, SE3):
+    if not isinstance(pose, Turning):
         return jnp.asarray(True)
     r = pose.rotation
     off = jnp.max(jnp.abs(r @ r.T - jnp.eye(3, dtype=r.dtype)))
@@ -49,19 +52,29 @@ def is_pose(pose: Pose) -> jax.Array:
 
 def settle(pose: Pose) -> Pose:
     """The pose with its rotation made orthonormal to roundoff: the nearest one, by two Newton steps."""
-    if not isinstance(pose, SE3):
+    if not isinstance(pose, Turning):
         return pose
     r = pose.rotation
     for _ in range(2):
         r = r @ (3 * jnp.eye(3, dtype=r.dtype) - r.T @ r) / 2
-    return jax.tree.unflatten(jax.tree.structure(pose), (pose.translation, r))
+    return like(pose, _shift(pose), r)
+
+
+def like(pose: Turning, shift: jax.Array, rotation: jax.Array) -> Turning:
+    """A pose of the same kind: `shift` is a translation (3,), or a slide ()."""
+    return jax.tree.unflatten(jax.tree.structure(pose), (shift, rotation))
+
+
+def _shift(pose: Turning) -> jax.Array:
+    return pose.s if isinstance(pose, AxisPose) else pose.translation
 
 
 def retract(pose: Pose, twist: jax.Array) -> Pose:
     """The pose reached from `pose` by the tangent increment `twist` (n,)."""
     if isinstance(pose, SE3):
-        moved = (pose.translation + twist[:3], cayley(twist[3:]) @ pose.rotation)
-        return jax.tree.unflatten(jax.tree.structure(pose), moved)
+        return like(pose, pose.translation + twist[:3], cayley(twist[3:]) @ pose.rotation)
+    if isinstance(pose, AxisPose):
+        return like(pose, pose.s + twist[0], cayley(twist[1:]) @ pose.rotation)
     if isinstance(pose, Turned):  # Cayley's map in the plane
         (c, s), half = pose.direction, twist[2] / 2
         cosine, sine = (1 - half * half) / (1 + half * half), 2 * half / (1 + half * half)
@@ -72,17 +85,17 @@ def retract(pose: Pose, twist: jax.Array) -> Pose:
 
 def difference(pose: Pose, other: Pose) -> jax.Array:
     """The tangent that retracts `pose` to `other`. -> (n,)"""
-    if isinstance(pose, SE3):
+    if isinstance(pose, Turning):
         turn = other.rotation @ pose.rotation.T
         axial = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-        return jnp.concatenate([other.translation - pose.translation, 2 * axial / (1 + jnp.trace(turn))])
+        return jnp.concatenate([position(other) - position(pose), 2 * axial / (1 + jnp.trace(turn))])
     return other - pose
 
 
 def tangent_size(pose: Pose) -> int:
     """n, the number of degrees of freedom."""
-    if isinstance(pose, SE3):
-        return 6
+    if isinstance(pose, Turning):
+        return 6 if isinstance(pose, SE3) else 4
     return 3 if isinstance(pose, Turned) else pose.shape[0]
 
 
@@ -93,6 +106,8 @@ def tangent_zero(pose: Pose) -> jax.Array:
 
 def position(pose: Pose) -> jax.Array:
     """The coordinates of the pose that are not a rotation matrix. -> (d,)"""
+    if isinstance(pose, AxisPose):
+        return pose.s[..., None]
     return pose.translation if isinstance(pose, SE3 | Turned) else pose
 
 
@@ -100,6 +115,8 @@ def pose_units(pose: Pose, declared: tuple[int, ...] | None) -> tuple[int, ...]:
     """1 = length, 0 = angle, for every tangent coordinate; undeclared means all lengths."""
     if isinstance(pose, SE3):
         return (1, 1, 1, 0, 0, 0)
+    if isinstance(pose, AxisPose):
+        return (1, 0, 0, 0)
     if isinstance(pose, Turned):
         return (1, 1, 0)
     return (1,) * pose.shape[0] if declared is None else declared
@@ -110,6 +127,9 @@ def place(pose: Pose, points: jax.Array) -> jax.Array:
     count, dimension = points.shape
     if isinstance(pose, SE3):
         return pose.translation + points @ pose.rotation.T
+    if isinstance(pose, AxisPose):
+        along = jnp.asarray([0.0, 0.0, 1.0], points.dtype)
+        return (points + pose.s * along) @ pose.rotation.T
     if isinstance(pose, Turned):
         return pose.translation + points @ turn_onto(pose.direction).T
     if pose.shape == (dimension,):

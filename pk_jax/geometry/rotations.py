@@ -74,9 +74,39 @@ def to_rotation_vector(r: jax.Array) -> jax.Array:
     return jnp.where(is_small, 2 * _series(_ARCSINE, squared), 2 * jnp.arctan2(sine, q[0]) / sine) * q[1:]
 
 
+def from_angles(angles: jax.Array) -> jax.Array:
+    """Rz(yaw) Ry(pitch) Rx(roll) of (roll, pitch, yaw) in rad. -> (3, 3)"""
+    (cr, cp, cy), (sr, sp, sy) = jnp.cos(angles), jnp.sin(angles)
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def to_angles(r: jax.Array) -> jax.Array:
+    """(roll, pitch, yaw) with |pitch| <= pi/2; at pitch +-pi/2, where only one combination of the
+    other two is known, the roll is zero. -> (3,) rad
+    """
+    flat = r[0, 0] ** 2 + r[1, 0] ** 2
+    is_upright = flat < GIMBAL
+    cosine = jnp.sqrt(jnp.where(is_upright, 1, flat))
+    pitch = jnp.where(is_upright, jnp.sign(-r[2, 0]) * jnp.pi / 2, jnp.arctan2(-r[2, 0], cosine))
+    one = jnp.ones_like(flat)
+    roll = jnp.where(is_upright, 0, jnp.arctan2(r[2, 1], jnp.where(is_upright, one, r[2, 2])))
+    yaw = jnp.where(
+        is_upright,
+        jnp.arctan2(-r[0, 1], r[1, 1]),
+        jnp.arctan2(r[1, 0], jnp.where(is_upright, one, r[0, 0])),
+    )
+    return jnp.stack([roll, pitch, yaw])
+
+
 # functions of the square of an angle, or of its sine, with derivatives of every order at zero
 
 SMALL = 1e-2
+GIMBAL = 1e-24  # squared cosine of the pitch below which roll and yaw are one angle
 _SINE = (1, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800)
 _ARCSINE = (1, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040, 135135 / 9676800)
 

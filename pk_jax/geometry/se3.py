@@ -34,7 +34,7 @@ class SE3:
         checks.has_shape("SE3.translation", self.translation, (*[None] * min(len(batch), 1), 3))
         checks.has_shape("SE3.rotation", self.rotation, (*batch, 3, 3))
         if checks.is_concrete(self):
-            _check_rotations(np.asarray(self.rotation))
+            check_rotations("SE3.rotation", np.asarray(self.rotation))
 
     @classmethod
     def from_quaternion(cls, translation: Any, quaternion: Any) -> SE3:
@@ -65,28 +65,30 @@ class SE3:
         return jax.tree.map(lambda leaf: leaf[row], self)
 
 
-_KEYS = jax.tree_util.GetAttrKey("translation"), jax.tree_util.GetAttrKey("rotation")
+def register(cls: type) -> None:
+    """Make a pose class a pytree. JAX rebuilds it with tracers, and only callers meet __post_init__."""
+    names = tuple(field.name for field in dataclasses.fields(cls))
+    keys = tuple(map(jax.tree_util.GetAttrKey, names))
+
+    def flatten(pose):
+        return tuple(getattr(pose, name) for name in names), None
+
+    def flatten_with_keys(pose):
+        return tuple(zip(keys, flatten(pose)[0], strict=True)), None
+
+    def unflatten(_, leaves):
+        pose = object.__new__(cls)
+        for name, leaf in zip(names, leaves, strict=True):
+            object.__setattr__(pose, name, leaf)
+        return pose
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
 
 
-def _flatten(pose: SE3):
-    return (pose.translation, pose.rotation), None
+register(SE3)
 
 
-def _flatten_with_keys(pose: SE3):
-    return tuple(zip(_KEYS, _flatten(pose)[0], strict=True)), None
-
-
-def _unflatten(_: None, leaves: Any) -> SE3:  # JAX rebuilds with tracers: only callers are checked
-    pose = object.__new__(SE3)
-    object.__setattr__(pose, "translation", leaves[0])
-    object.__setattr__(pose, "rotation", leaves[1])
-    return pose
-
-
-jax.tree_util.register_pytree_with_keys(SE3, _flatten_with_keys, _unflatten, _flatten)
-
-
-def _check_rotations(rotation: np.ndarray) -> None:
+def check_rotations(name: str, rotation: np.ndarray) -> None:
     """ValueError for the first finite rotation that is none; NaN rows are the solvers' business."""
     with np.errstate(invalid="ignore", over="ignore"):
         off = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max(axis=(-2, -1))
@@ -105,4 +107,4 @@ def _check_rotations(rotation: np.ndarray) -> None:
             row = tuple(int(i) for i in np.argwhere(np.atleast_1d(wrong))[0]) if wrong.ndim else ()
             where = f"[{row[0]}]" if row else ""
             value = f"{off[row]:.3g}" if "orthonormal" in what else "det = -1"
-            raise ValueError(f"SE3.rotation{where} {what} {value}")
+            raise ValueError(f"{name}{where} {what} {value}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pk_jax import checks
-from pk_jax.geometry.se3 import SE3
+from pk_jax.geometry.poses import Turning
 from pk_jax.mechanisms.base import Mechanism
 
 
@@ -29,16 +30,16 @@ def _home_shapes(tree: Any, leaves: tuple) -> tuple[Any, jax.ShapeDtypeStruct]:
 
 def rows_of(name: str, value: Any, one: Any, *, numpy: bool = False) -> tuple[Any, bool]:
     """`value` with the leaves of `one`, or with one leading batch axis more; and whether it has that axis."""
-    if isinstance(one, SE3):
-        if not isinstance(value, SE3):
-            raise ValueError(f"{name} must be a pk_jax.SE3, got {type(value).__name__}")
+    if isinstance(one, Turning):
+        if type(value) is not type(one):
+            raise ValueError(f"{name} must be a pk_jax.{type(one).__name__}, got {type(value).__name__}")
+        parts = [field.name for field in dataclasses.fields(one)]
         rows = [
-            rows_of(f"{name}.{part}", getattr(value, part), getattr(one, part), numpy=numpy)
-            for part in _PARTS
+            rows_of(f"{name}.{part}", getattr(value, part), getattr(one, part), numpy=numpy) for part in parts
         ]
         return jax.tree.unflatten(jax.tree.structure(one), [row for row, _ in rows]), rows[0][1]
-    if isinstance(value, SE3):
-        raise ValueError(f"{name} must be an array of shape {one.shape}, got an SE3")
+    if isinstance(value, Turning):
+        raise ValueError(f"{name} must be an array of shape {one.shape}, got an {type(value).__name__}")
     array = (checks.real_numpy if numpy else checks.real_array)(name, value)
     array = array if array.dtype == one.dtype else array.astype(one.dtype)
     if array.ndim == one.ndim + 1:
@@ -56,9 +57,6 @@ def configurations(mech: Mechanism, pose: Any, joints: Any) -> tuple[tuple[Any, 
     pose, poses = rows_of("pose", pose, pose_like)
     joints, many = rows_of("joints", joints, joints_like)
     return (pose, joints), (poses, many)
-
-
-_PARTS = ("translation", "rotation")
 
 
 def over_rows(function: Callable, arguments: tuple, are_batched: tuple[bool, ...]) -> Any:

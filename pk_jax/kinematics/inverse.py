@@ -38,11 +38,13 @@ def inverse_kinematics(
     pose:    like the mechanism's, or batched on a leading axis
     branch:  signs of the working mode, (s,) or (batch, s), as many as the mechanism's own, which is the
              default
-    free:    values of kinematically redundant joints, for mechanisms that have them
+    free:    values of the kinematically redundant joints, of mechanisms that have some, (k,) or
+             (batch, k); of a single one also () or (batch,); default: as at home. See
+             `resolve_redundancy` for others.
 
     Status: OK: closed to roundoff; UNREACHABLE: no real joints; SINGULAR: a type I singularity (a leg
     stretched or folded), where the joints exist, in `candidate`, but their rates do not; BAD_INPUT:
-    NaN or infinity in the pose; STALLED: joints that do not close the loops. Without a closed form
+    NaN or infinity in the pose, or a free joint that is none; STALLED: joints that do not close the loops. Without a closed form
     they come from Newton, started at home. BAD_INPUT also: a traced branch that holds no signs, or a
     traced rotation that is none.
     The derivative of a row that is not OK is zero.
@@ -51,10 +53,20 @@ def inverse_kinematics(
     pose, many = rows_of("pose", pose, home_shapes(mech)[0])
     if checks.is_concrete((mech, pose)):
         _warn_of_units(mech, pose)
-    if branch is None:
-        return _solve(mech, (pose,), free, (many,))
-    branch, branches = branch_rows(mech, branch)
-    return _solve(mech, (pose, branch), free, (many, branches))
+    branch, branches = (None, False) if branch is None else branch_rows(mech, branch)
+    free, frees = (None, False) if free is None else free_rows(mech, free)
+    return _solve(mech, (pose, branch, free), (many, branches, frees))
+
+
+def free_rows(mech: Mechanism, free: Any) -> tuple[jax.Array, bool]:
+    """Values of the kinematically redundant joints, (k,) or (batch, k), as `inverse_kinematics` takes them."""
+    count = type(mech).free_joints
+    if not count:
+        raise ValueError(f"free must be left out: {type(mech).__name__} has no kinematically redundant joint")
+    array = checks.real_array("free", free)
+    if count == 1 and array.shape != (1,) and array.ndim < 2:
+        array = array[..., None]
+    return rows_of("free", array, jax.ShapeDtypeStruct((count,), home_shapes(mech)[1].dtype))
 
 
 def _warn_of_units(mech: Mechanism, pose: Any) -> None:
@@ -96,21 +108,25 @@ def working_modes(mech: Mechanism) -> np.ndarray:
     return default * np.array(list(itertools.product((1.0, -1.0), repeat=shape.shape[0])), default.dtype)
 
 
-@partial(jax.jit, static_argnums=3)
-def _solve(mech, pose_and_branch, free, are_batched):
-    return over_rows(lambda *row: _one(mech, *row, free=free), pose_and_branch, are_batched)
+@partial(jax.jit, static_argnums=2)
+def _solve(mech, rows, are_batched):
+    return over_rows(partial(_one, mech), rows, are_batched)
 
 
-def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, *, free: Any = None) -> InverseKinematics:
+def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, free: Any = None) -> InverseKinematics:
     home_pose, home_joints = mech.home()
     is_given = all_finite(pose) & is_pose(pose)
     is_mode = True if branch is None else jnp.all(jnp.abs(branch) == 1)
+    if free is not None:
+        at_home = home_joints[home_joints.shape[0] - type(mech).free_joints :]
+        is_given &= all_finite(free) & (jnp.all(free > 0) if mech.joints_are_distances else True)
+        free = jnp.where(is_given, free, at_home)
     pose = settle(where(is_given, pose, home_pose))  # lost rows work on the home pose and are masked after
     if hasattr(mech, "inverse"):
         joints_at = lambda pose: mech.inverse(pose, branch, free=free)
         failed = Status.UNREACHABLE
     else:
-        joints_at = lambda pose: _by_newton(mech, pose)
+        joints_at = lambda pose: _by_newton(mech, pose, free)
         failed = Status.STALLED
 
     found = lax.stop_gradient(joints_at(lax.stop_gradient(pose)))
@@ -138,12 +154,21 @@ def least_joint_sigma(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Arra
     return jnp.linalg.svd(scaled, compute_uv=False)[-1]
 
 
-def _by_newton(mech: Mechanism, pose: jax.Array) -> jax.Array:
+def _by_newton(mech: Mechanism, pose: jax.Array, free: Any = None) -> jax.Array:
     """Joints from the residual alone; NaN where Newton did not end on a root. -> (m,)"""
     fixed, at = lax.stop_gradient((mech, pose))
     start = fixed.home()[1]
+    count = start.shape[0] - type(mech).free_joints  # the others stay where they are
+    held = start[count:] if free is None else free
+    whole = lambda q, held: jnp.concatenate([q, held])
     add = lambda joints, step: joints + step
-    linearize = lambda q: (fixed.residual(at, q), joint_jacobian(fixed, at, q))
-    found = newton.solve(linearize, add, start, scale=joint_scale(fixed, start)).point
-    joints = newton.implicit(lambda q: mech.residual(pose, q), add, found, start.size)
-    return jnp.where(is_closed(fixed, at, found), joints, jnp.nan)
+    still = lax.stop_gradient(held)
+
+    def linearize(q):
+        q = whole(q, still)
+        return fixed.residual(at, q), joint_jacobian(fixed, at, q)[:, :count]
+
+    scale = joint_scale(fixed, start)[:count]
+    found = newton.solve(linearize, add, start[:count], scale=scale).point
+    joints = whole(newton.implicit(lambda q: mech.residual(pose, whole(q, held)), add, found, count), held)
+    return jnp.where(is_closed(fixed, at, whole(found, still)), joints, jnp.nan)

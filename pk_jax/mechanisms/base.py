@@ -43,6 +43,8 @@ class Mechanism(abc.ABC):
     pose_units: ClassVar[tuple[int, ...] | None] = None  # the same for the tangent of an array pose
     joints_are_distances: ClassVar[bool] = False  # joints that are not positive make no sense
     actuated_rows: ClassVar[int | None] = None  # the first so many equations carry force; None = all
+    free_joints: ClassVar[int] = 0  # the last so many joints: a pose leaves them free (kinematic redundancy)
+    joint_names: ClassVar[tuple[str, ...] | None] = None  # for files; default: q1, q2, ... or l1, l2, ...
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -119,12 +121,17 @@ class Mechanism(abc.ABC):
         """
         return None
 
+    def free_range(self) -> jax.Array:
+        """Least and greatest value of each of the free joints, of mechanisms that have some. -> (k, 2)"""
+        raise NotImplementedError(f"{type(self).__name__} has free joints and no free_range()")
+
     @abc.abstractmethod
     def skeleton(self, pose: Any, joints: jax.Array) -> Skeleton:
         """What to draw."""
 
     # Optional: a mechanism with a closed form defines
-    #     inverse(pose, branch=None, *, free=None) -> joints, NaN where unreachable
+    #     inverse(pose, branch=None, *, free=None) -> joints, NaN where unreachable; free: values
+    #         (free_joints,) of the kinematically redundant joints, home's where there are none
     #     forward(joints) -> (poses, is_real), every assembly mode, fixed shape
 
     def linearize(self, pose: Any, joints: jax.Array) -> tuple[jax.Array, jax.Array]:

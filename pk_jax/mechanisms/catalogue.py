@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pk_jax.mechanisms.base import Mechanism
+from pk_jax.mechanisms.casing_oscillator import CasingOscillator
 from pk_jax.mechanisms.five_bar import FiveBar
 from pk_jax.mechanisms.planar_rpr import PlanarRPR
 from pk_jax.mechanisms.planar_rrr import PlanarRRR
@@ -127,6 +128,9 @@ CATALOGUE: dict[str, Entry] = {
     "6-link": Entry(
         lambda: SixLink(base=[[-0.2, 0], [0.2, 0]], platform=[[-0.1, 0], [0.1, 0]], proximal=0.3, distal=0.3),
         f"{_EXAMPLE} redundant 6-link; lengths in m",
+    ),
+    "casing-oscillator": Entry(
+        CasingOscillator, "construction machine of Nam, Bae and Park, Table 1, carriage restored; lengths in m"
     ),
     "sauer-3-rpr": Entry(
         _sauer_3_rpr, "planar Stewart platform of Sauer, Numerical Analysis, Reality Check 1; no unit"

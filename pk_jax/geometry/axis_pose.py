@@ -42,7 +42,9 @@ class AxisPose:
         given = {"s": s, "roll": roll, "pitch": pitch, "yaw": yaw}
         values = [checks.real_array(name, value) for name, value in given.items()]
         s, *angles = jnp.broadcast_arrays(*(value.astype(jnp.result_type(*values)) for value in values))
-        return cls(s, jnp.vectorize(rotations.from_angles, signature="(3)->(3,3)")(jnp.stack(angles, axis=-1)))
+        return cls(
+            s, jnp.vectorize(rotations.from_angles, signature="(3)->(3,3)")(jnp.stack(angles, axis=-1))
+        )
 
     def angles(self) -> jax.Array:
         """Roll, pitch and yaw, |pitch| <= pi/2. -> (..., 3) rad"""

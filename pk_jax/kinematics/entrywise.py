@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,6 @@ from pk_jax.kinematics.lanes import (
     plus,
     stack,
     times,
-    total,
 )
 
 
@@ -62,15 +61,36 @@ class Invariants:
         self.fixed |= {id(item) for entries in outputs for item in entries.items}
 
 
-def entrywise(function: Callable, *arguments: Any, invariants: Invariants | None = None) -> Any:
+class Rules(NamedTuple):
+    """Arithmetic of entries: of lanes here, of other numbers elsewhere."""
+
+    plus: Callable
+    minus: Callable
+    times: Callable
+    over: Callable
+    negative: Callable
+    square: Callable
+    power: Callable  # (item, whole number)
+    greater: Callable
+    lesser: Callable
+    elementwise: Callable  # (equation, *items), any other primitive
+    can_fall_back: bool  # to `vmap`
+
+
+def entrywise(
+    function: Callable, *arguments: Any, invariants: Invariants | None = None, rules: Rules | None = None
+) -> Any:
     """`function(*arguments)`, where the leaves of the arguments and of the answer are `Entries`."""
+    rules = rules or LANES
     leaves, tree = jax.tree.flatten(arguments, is_leaf=is_entries)
-    dtype = next(item.dtype for leaf in leaves for item in leaf.items if isinstance(item, jax.Array))
+    dtype = next(item.dtype for leaf in leaves for item in leaf.items if not is_known(item))
     traced = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(leaf.shape, dtype) for leaf in leaves])
     jaxpr, answer = jax.make_jaxpr(function, return_shape=True)(*traced)
     try:
-        found = _evaluate(jaxpr.jaxpr, jaxpr.consts, leaves, invariants)
+        found = _evaluate(jaxpr.jaxpr, jaxpr.consts, leaves, rules, invariants)
     except UnknownPrimitive:
+        if not rules.can_fall_back:
+            raise
         found = _vmapped(function, tree, leaves, dtype)
     if invariants is not None:
         invariants.is_complete = True
@@ -90,6 +110,7 @@ def _evaluate(
     jaxpr: Jaxpr,
     constants: Sequence[Any],
     arguments: Sequence[Entries],
+    rules: Rules,
     invariants: Invariants | None = None,
     path: tuple[int, ...] = (),
 ) -> list[Entries]:
@@ -106,7 +127,7 @@ def _evaluate(
             outputs = invariants.found[here]
         else:
             inputs = [read(atom) for atom in equation.invars]
-            outputs = _apply(equation, inputs, invariants, here)
+            outputs = _apply(equation, inputs, rules, invariants, here)
             if invariants is not None and not invariants.is_complete and invariants.holds(inputs):
                 invariants.keep(here, outputs)
         values.update(zip(equation.outvars, outputs, strict=True))
@@ -119,26 +140,26 @@ def _known(value: Any) -> Entries:
 
 
 def _apply(
-    equation, inputs: list[Entries], invariants: Invariants | None, path: tuple[int, ...]
+    equation, inputs: list[Entries], rules: Rules, invariants: Invariants | None, path: tuple[int, ...]
 ) -> list[Entries]:
     name, params = equation.primitive.name, equation.params
     if (inner := _called(params)) is not None:
-        return _evaluate(inner.jaxpr, inner.consts, inputs, invariants, path)
+        return _evaluate(inner.jaxpr, inner.consts, inputs, rules, invariants, path)
     if name in _STRUCTURAL:
         return _STRUCTURAL[name](inputs, params)
     if name in _REDUCTIONS:
-        return [_reduce(_REDUCTIONS[name], inputs[0], params["axes"])]
+        return [_reduce(_REDUCTIONS[name](rules), inputs[0], params["axes"])]
     if name == "dot_general":
-        return [_dot_general(*inputs, params["dimension_numbers"])]
+        return [_dot_general(*inputs, params["dimension_numbers"], rules)]
     if name == "iota":
         return [_iota(params["shape"], params["dimension"])]
     is_float = jnp.issubdtype(equation.outvars[0].aval.dtype, jnp.floating)
     if name in _ARITHMETIC and is_float:
-        function = _ARITHMETIC[name]
+        function = _ARITHMETIC[name](rules)
     elif name == "integer_pow" and is_float:
-        function = functools.partial(_integer_power, y=params["y"])
+        function = functools.partial(rules.power, y=params["y"])
     elif name in _ELEMENTWISE or name in _ARITHMETIC:  # whole numbers divide and overflow as JAX says
-        function = functools.partial(_bind, equation)
+        function = functools.partial(rules.elementwise, equation)
     else:
         raise UnknownPrimitive(name)
     shape = equation.outvars[0].aval.shape
@@ -154,16 +175,21 @@ def _called(params: dict[str, Any]) -> ClosedJaxpr | None:
     return None
 
 
-def _bind(equation, *items: Lane) -> Lane:
-    """An elementwise primitive on one entry of each operand."""
+def picked(equation, *items: Any) -> Any:
+    """What a choice or a conversion that is known gives of its items; None for anything else."""
     if equation.primitive.name == "select_n" and is_known(items[0]):
         return items[1 + int(items[0])]
     if equation.primitive.name == "convert_element_type" and is_known(items[0]):
         return np.asarray(items[0]).astype(equation.outvars[0].aval.dtype).item()
+    return None
+
+
+def _bind(equation, *items: Lane) -> Lane:
+    """An elementwise primitive on one entry of each operand."""
+    if (item := picked(equation, *items)) is not None:
+        return item
     if all(map(is_known, items)):
-        with jax.ensure_compile_time_eval():
-            arrays = [jnp.asarray(x, atom.aval.dtype) for x, atom in zip(items, equation.invars, strict=True)]
-            return np.asarray(equation.primitive.bind(*arrays, **equation.params)).item()
+        return of_known(equation, *items)
     shape = jnp.broadcast_shapes(*(jnp.shape(item) for item in items))
     arrays = [
         jnp.broadcast_to(jnp.asarray(x, atom.aval.dtype), shape)
@@ -172,20 +198,40 @@ def _bind(equation, *items: Lane) -> Lane:
     return equation.primitive.bind(*arrays, **equation.params)
 
 
+def of_known(equation, *items: Any) -> Any:
+    """An elementwise primitive on known numbers, as JAX computes it."""
+    with jax.ensure_compile_time_eval():
+        arrays = [jnp.asarray(x, atom.aval.dtype) for x, atom in zip(items, equation.invars, strict=True)]
+        return np.asarray(equation.primitive.bind(*arrays, **equation.params)).item()
+
+
 def _integer_power(base: Lane, y: int) -> Lane:
     return functools.reduce(times, [base] * y, 1.0) if y >= 0 else over(1.0, _integer_power(base, -y))
 
 
-_ARITHMETIC: dict[str, Callable] = {
-    "add": plus,
-    "add_any": plus,
-    "sub": minus,
-    "mul": times,
-    "div": over,
-    "neg": lambda a: -a,
-    "square": lambda a: times(a, a),
-    "copy": lambda a: a,
-    "copy_p": lambda a: a,
+LANES = Rules(
+    plus,
+    minus,
+    times,
+    over,
+    lambda a: -a,
+    lambda a: times(a, a),
+    _integer_power,
+    lambda a, b: jnp.maximum(a, b),
+    lambda a, b: jnp.minimum(a, b),
+    _bind,
+    can_fall_back=True,
+)
+_ARITHMETIC: dict[str, Callable[[Rules], Callable]] = {
+    "add": lambda rules: rules.plus,
+    "add_any": lambda rules: rules.plus,
+    "sub": lambda rules: rules.minus,
+    "mul": lambda rules: rules.times,
+    "div": lambda rules: rules.over,
+    "neg": lambda rules: rules.negative,
+    "square": lambda rules: rules.square,
+    "copy": lambda rules: lambda a: a,
+    "copy_p": lambda rules: lambda a: a,
 }
 # fmt: off
 _ELEMENTWISE = frozenset((
@@ -196,13 +242,13 @@ _ELEMENTWISE = frozenset((
     "select_n", "sign", "sin", "sinh", "sqrt", "stop_gradient", "tan", "tanh", "xor",
 ))
 # fmt: on
-_REDUCTIONS: dict[str, Callable] = {
-    "reduce_sum": plus,
-    "reduce_prod": times,
-    "reduce_max": lambda a, b: jnp.maximum(a, b),
-    "reduce_min": lambda a, b: jnp.minimum(a, b),
-    "reduce_and": lambda a, b: jnp.logical_and(a, b),
-    "reduce_or": lambda a, b: jnp.logical_or(a, b),
+_REDUCTIONS: dict[str, Callable[[Rules], Callable]] = {
+    "reduce_sum": lambda rules: rules.plus,
+    "reduce_prod": lambda rules: rules.times,
+    "reduce_max": lambda rules: rules.greater,
+    "reduce_min": lambda rules: rules.lesser,
+    "reduce_and": lambda rules: lambda a, b: jnp.logical_and(a, b),
+    "reduce_or": lambda rules: lambda a, b: jnp.logical_or(a, b),
 }
 
 
@@ -216,7 +262,7 @@ def _reduce(function: Callable, entries: Entries, axes: Sequence[int]) -> Entrie
     return Entries(shape, [functools.reduce(function, [entries.items[i] for i in row]) for row in rows])
 
 
-def _dot_general(left: Entries, right: Entries, dimension_numbers) -> Entries:
+def _dot_general(left: Entries, right: Entries, dimension_numbers, rules: Rules) -> Entries:
     (left_sum, right_sum), (left_batch, right_batch) = dimension_numbers
     if not (left.items and right.items):
         raise UnknownPrimitive("a product of nothing")
@@ -230,7 +276,11 @@ def _dot_general(left: Entries, right: Entries, dimension_numbers) -> Entries:
     rows, left_sizes = arranged(left, left_sum, left_batch)
     columns, right_sizes = arranged(right, right_sum, right_batch)
     items = [
-        total([times(left.items[i], right.items[j]) for i, j in zip(row, column, strict=True)])
+        functools.reduce(
+            rules.plus,
+            [rules.times(left.items[i], right.items[j]) for i, j in zip(row, column, strict=True)],
+            0.0,
+        )
         for batch in range(len(rows))
         for row, column in itertools.product(rows[batch], columns[batch])
     ]

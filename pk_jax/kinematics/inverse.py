@@ -44,9 +44,9 @@ def inverse_kinematics(
 
     Status: OK: closed to roundoff; UNREACHABLE: no real joints; SINGULAR: a type I singularity (a leg
     stretched or folded), where the joints exist, in `candidate`, but their rates do not; BAD_INPUT:
-    NaN or infinity in the pose, or a free joint that is none; STALLED: joints that do not close the loops. Without a closed form
-    they come from Newton, started at home. BAD_INPUT also: a traced branch that holds no signs, or a
-    traced rotation that is none.
+    NaN or infinity in the pose, or a free joint that is none; STALLED: joints that do not close
+    the loops. Without a closed form they come from Newton, started at home. BAD_INPUT also: a traced
+    branch that holds no signs, or a traced rotation that is none.
     The derivative of a row that is not OK is zero.
     """
     require_mechanism("inverse_kinematics", mech)
@@ -59,7 +59,7 @@ def inverse_kinematics(
 
 
 def free_rows(mech: Mechanism, free: Any) -> tuple[jax.Array, bool]:
-    """Values of the kinematically redundant joints, (k,) or (batch, k), as `inverse_kinematics` takes them."""
+    """Values of the kinematically redundant joints, (k,) or (batch, k), in all forms that users give."""
     count = type(mech).free_joints
     if not count:
         raise ValueError(f"free must be left out: {type(mech).__name__} has no kinematically redundant joint")

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-Lane = Any  # a traced or known array, all lanes of one shape or scalars; or a known Python number
+Lane = Any  # an array, all lanes of one shape or scalars; or a known Python number
 
 
 class Entries(NamedTuple):
@@ -73,7 +73,7 @@ def rebuilt(items: Sequence[Lane], like: Any) -> Any:
 
 
 def is_known(item: Lane) -> bool:
-    return not isinstance(item, jax.Array)
+    return isinstance(item, bool | int | float | np.generic)
 
 
 def times(a: Lane, b: Lane) -> Lane:

@@ -55,7 +55,12 @@ class CasingOscillator(LegMechanism):
     free_joints = 1
 
     def check_shapes(self) -> None:
-        for name, shape in (("base_radius", ()), ("platform_radius", ()), ("neutral", (2,)), ("stroke", (5, 2))):
+        for name, shape in (
+            ("base_radius", ()),
+            ("platform_radius", ()),
+            ("neutral", (2,)),
+            ("stroke", (5, 2)),
+        ):
             checks.has_shape(f"CasingOscillator.{name}", getattr(self, name), shape)
         for name in ("base_cone", "platform_cone"):
             if (cone := getattr(self, name)).shape not in ((), (LEGS,)):
@@ -67,7 +72,8 @@ class CasingOscillator(LegMechanism):
         least, greatest = np.asarray(self.stroke).T
         if not np.all((least > 0) & (least < greatest)):
             raise ValueError(
-                f"CasingOscillator.stroke must be 0 < least < greatest, got {np.asarray(self.stroke).tolist()}"
+                "CasingOscillator.stroke must be 0 < least < greatest, "
+                f"got {np.asarray(self.stroke).tolist()}"
             )
         for name in ("base_cone", "platform_cone"):
             if not np.all(((cone := np.asarray(getattr(self, name))) > 0) & (cone <= np.pi)):
@@ -108,7 +114,7 @@ class CasingOscillator(LegMechanism):
         return self.stroke[LEGS:]
 
     def inverse(self, pose: AxisPose, branch: jax.Array | None = None, *, free=None) -> jax.Array:
-        """Leg lengths, eq. (10), with the carriage at `free`, () or (1,), by default the neutral one. -> (5,)"""
+        """Leg lengths, eq. (10), and the carriage: `free`, () or (1,), by default the neutral one. -> (5,)"""
         carriage = self.neutral[1] if free is None else jnp.reshape(free, ())
         lengths = safe.norm(place(pose, self.attachments()) - self.base(carriage))
         return jnp.append(lengths, carriage)

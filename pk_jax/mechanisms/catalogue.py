@@ -130,7 +130,8 @@ CATALOGUE: dict[str, Entry] = {
         f"{_EXAMPLE} redundant 6-link; lengths in m",
     ),
     "casing-oscillator": Entry(
-        CasingOscillator, "construction machine of Nam, Bae and Park, Table 1, carriage restored; lengths in m"
+        CasingOscillator,
+        "construction machine of Nam, Bae and Park, Table 1, carriage restored; lengths in m",
     ),
     "sauer-3-rpr": Entry(
         _sauer_3_rpr, "planar Stewart platform of Sauer, Numerical Analysis, Reality Check 1; no unit"

@@ -1,0 +1,395 @@
+"""Proofs over boxes of poses: no singularity inside, and no way out of them within the joints' limits.
+
+Everything is bounded by intervals with outward rounding (`kinematics.intervals`), boxes are bisected until
+each is settled, and what could not be settled is handed back: a certificate is a proof or says that it is
+none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pk_jax import checks
+from pk_jax.analysis.slices import coordinate_names
+from pk_jax.geometry import rotations
+from pk_jax.geometry.axis_pose import AxisPose
+from pk_jax.geometry.poses import position, retract, tangent_zero
+from pk_jax.geometry.se3 import SE3
+from pk_jax.kinematics.batching import home_shapes
+from pk_jax.kinematics.entrywise import UnknownPrimitive
+from pk_jax.kinematics.intervals import (
+    Interval,
+    absolute,
+    determinant,
+    enclosure,
+    matrix_product,
+    minus,
+    over,
+    plus,
+    power,
+    thin,
+    times,
+    total,
+)
+from pk_jax.mechanisms.base import Mechanism, require_mechanism
+
+MOST = 1_000_000  # boxes
+AT_A_TIME = 2048
+
+Report = Callable[..., None]
+
+
+class Certificate(NamedTuple):
+    """What was proved. Names and order of the coordinates are in `names`."""
+
+    is_proved: bool
+    bound: float  # what the proof leaves to spare, see the function; NaN where it is none
+    boxes: int  # examined
+    names: tuple[str, ...]
+    lower: np.ndarray  # (d,) of the whole box
+    upper: np.ndarray
+    unsettled: tuple[np.ndarray, np.ndarray]  # lower and upper (k, d) of boxes that are left
+
+
+def certify_regular(
+    mech: Mechanism,
+    ranges: Mapping[str, Sequence[float]],
+    *,
+    scale: Callable[[jax.Array], jax.Array] | None = None,
+    at_least: float = 0.0,
+    within: Sequence[str] = (),
+    most: int = MOST,
+    report: Report | None = None,
+) -> Certificate:
+    """Prove that a box of poses and free joints has no type II singularity: A regular all over it.
+
+    ranges:  (lower, upper) by name: coordinates of the pose as in `singularity_locus`, angles in rad, and
+             free joints. Coordinates that are left out stay as at home. The turn (rx, ry, rz) of an
+             `SE3` is here a Cayley vector, 2 tan(angle / 2) along the axis, from home.
+    scale:   what |det A| is measured in, a positive function of the coordinates in the order of
+             `Certificate.names` (all of them); default: |det A| at home
+    at_least: what |det A| / scale must exceed, so that `bound` does
+    within:  names of margins: parts of the box where one of them is negative need not be regular
+    most:    boxes to examine at most
+    report:  called with (what, done, total)
+
+    On every part, C A = 1 + D with C close to A^-1 at its middle; where every row of |D|, scaled,
+    sums up to less than 1, A is regular, and det A = det(1 + D) / det C is bounded. `bound` is a lower bound
+    of |det A| / scale over the whole box. Not proved where boxes are left: the box may hold a
+    singularity, or `most` was too small. ValueError for mechanisms that `enclosure` has no
+    rules for, or whose A depends on joints that are not free.
+    """
+    box = _Box("certify_regular", mech, ranges)
+    if mech.actuated_rows is not None or box.equations != box.n:
+        raise ValueError(
+            f"certify_regular needs as many equations as coordinates, {type(mech).__name__} has others"
+        )
+    at_home, at_centre = (
+        float(np.linalg.det(_matrix(mech, mech.home(), jnp.asarray(values))))
+        for values in (box.home, Interval(*box.whole).middle)
+    )
+    if not np.isfinite(at_home):
+        raise ValueError(f"no certificate for {type(mech).__name__}: A depends on joints that are not free")
+    settle = partial(_regular, box, scale or abs(at_home), tuple(within), at_least, np.sign(at_centre))
+    return _bisected(box, settle, [box.whole], most, report, "no singularity")
+
+
+def certify_confined(
+    mech: Mechanism,
+    ranges: Mapping[str, Sequence[float]],
+    *,
+    at_least: float = 0.0,
+    within: Sequence[str] | None = None,
+    most: int = MOST,
+    report: Report | None = None,
+) -> Certificate:
+    """Prove that the platform cannot leave a box of poses within its limits, starting from home.
+
+    ranges:  (lower, upper) of every coordinate of the pose, as for `certify_regular`. Free joints may have
+             any value in their `free_range()`, whatever the ranges say.
+    at_least: how far below zero a margin must be, so that `bound` exceeds it
+    within:  names of the margins that limit it; default: all
+    most, report:  as for `certify_regular`
+
+    On no face of the box are all margins >= 0, with any value of the free joints: so the component of the
+    workspace that home belongs to, connected in poses and free joints, lies inside the box. A part of
+    a face is ruled out by one margin, or by a sum of margins with weights >= 0 that is negative all over
+    it (as in Farkas' lemma). `bound` is a number that on every face one margin is below the negative of.
+    ValueError where home is not inside, or the angles are not those of one chart: |pitch| <
+    pi/2, |roll|, |yaw|, |phi| < pi.
+    """
+    require_mechanism("certify_confined", mech)
+    names = coordinate_names(mech)
+    if missing := [name for name in names if name not in ranges]:
+        raise ValueError(f"ranges must have every coordinate of the pose, {', '.join(missing)} missing")
+    free = (
+        dict(zip(_free_names(mech), np.asarray(mech.free_range()), strict=True)) if mech.free_joints else {}
+    )
+    box = _Box("certify_confined", mech, {**ranges, **free})
+    _check_chart(box)
+    whole_lower, whole_upper = box.whole
+    at_home = box.home[: len(names)]
+    if not np.all((whole_lower[: len(names)] < at_home) & (at_home < whole_upper[: len(names)])):
+        raise ValueError(f"ranges must hold the home pose, {dict(zip(names, at_home.tolist(), strict=True))}")
+    faces = []
+    for axis in range(len(names)):
+        for end in box.whole:
+            lower, upper = whole_lower.copy(), whole_upper.copy()
+            lower[axis] = upper[axis] = end[axis]
+            faces.append((lower, upper))
+    settle = partial(_excluded, box, None if within is None else tuple(within), at_least)
+    return _bisected(box, settle, faces, most, report, "no way out")
+
+
+# --- boxes of coordinates
+
+
+class _Box:
+    """The box that a user names, and functions of its coordinates (pose, then free joints)."""
+
+    def __init__(self, function: str, mech: Mechanism, ranges: Mapping[str, Sequence[float]]) -> None:
+        require_mechanism(function, mech)
+        if not checks.is_concrete(mech) or mech.length().dtype != jnp.float64:
+            raise ValueError("a certificate needs known values in float64: call pk_jax.enable_x64() first")
+        self.mech = mech
+        pose, joints = mech.home()
+        self.names = (*coordinate_names(mech), *_free_names(mech))
+        self.n = tangent_zero(pose).shape[0]
+        self.equations = jax.eval_shape(mech.residual, pose, joints).shape[0]
+        turn = rotations.to_angles(pose.rotation) if isinstance(pose, AxisPose) else np.zeros(3)
+        at = np.append(np.asarray(position(pose)), np.asarray(turn))[: self.n]
+        self.home = np.append(at, np.asarray(joints)[len(joints) - mech.free_joints :])
+        lower, upper = self.home.copy(), self.home.copy()
+        for name, given in ranges.items():
+            if name not in self.names:
+                raise ValueError(f"ranges must name some of {', '.join(self.names)}, got {name!r}")
+            ends = checks.real_numpy(f"ranges[{name!r}]", given).astype(float)
+            if ends.shape != (2,) or not np.all(np.isfinite(ends)) or not ends[0] <= ends[1]:
+                raise ValueError(f"ranges[{name!r}] must be (lower, upper), lower <= upper, got {given}")
+            place = self.names.index(name)
+            lower[place], upper[place] = ends
+        self.whole = lower, upper
+
+    def enclosed(self, function: Callable, lower: np.ndarray, upper: np.ndarray) -> Any:
+        """Bounds of `function(mech, home, coordinates)` over boxes (k, d)."""
+        try:
+            return enclosure(function, self.mech, self.mech.home(), Interval(lower, upper))
+        except UnknownPrimitive as error:
+            what = f"{type(self.mech).__name__}: there are no bounds of the primitive {error}"
+            raise ValueError(f"no certificate for {what}") from None
+
+
+def _free_names(mech: Mechanism) -> tuple[str, ...]:
+    m = home_shapes(mech)[1].shape[0]
+    names = mech.joint_names or tuple(f"q{i}" for i in range(1, m + 1))
+    return names[m - mech.free_joints :]
+
+
+def _check_chart(box: _Box) -> None:
+    limits = {"pitch": np.pi / 2, "roll": np.pi, "yaw": np.pi, "phi": np.pi}
+    for name, low, high in zip(box.names, *box.whole, strict=True):
+        if max(abs(low), abs(high)) >= limits.get(name, np.inf):
+            raise ValueError(f"ranges[{name!r}] must be inside +-{limits[name]:.6g} rad, got ({low}, {high})")
+
+
+def _pose_at(home: Any, values: jax.Array) -> Any:
+    """The pose of coordinates; `rotations.from_rotation_vector` has two formulas, intervals want one."""
+    if isinstance(home, AxisPose):
+        return AxisPose(values[0], rotations.from_angles(values[1:4]))
+    if isinstance(home, SE3):
+        start = SE3(jnp.zeros_like(home.translation), home.rotation)
+        return retract(start, values[:6])
+    return values[: home.shape[0]]
+
+
+# --- one box: A is regular
+
+
+@jax.jit
+def _matrix(mech: Mechanism, home: Any, values: jax.Array) -> jax.Array:
+    """A at coordinates; joints that are not free are NaN, so that none can have a say. -> (n, n)"""
+    pose, joints = home
+    bound = joints.shape[0] - type(mech).free_joints
+    unknown = jnp.full(bound, jnp.nan, joints.dtype)
+    joints = jnp.concatenate([unknown, values[values.shape[0] - type(mech).free_joints :]])
+    return mech.linearize(_pose_at(pose, values), joints)[1]
+
+
+@jax.jit
+def _matrix_slopes(mech: Mechanism, home: Any, values: jax.Array) -> jax.Array:
+    return jax.jacfwd(lambda v: _matrix(mech, home, v))(values)
+
+
+class _Settled(NamedTuple):
+    """What is known of boxes (k,)."""
+
+    bound: np.ndarray  # proved; NaN: nothing is
+    is_done: np.ndarray
+    spread: np.ndarray  # (k, d) how much each coordinate contributes to what is not known
+    is_lost: bool  # at some point the contrary holds
+
+
+def _regular(
+    box: _Box,
+    scale: Callable | float,
+    within: tuple[str, ...],
+    least: float,
+    sign: float,
+    lower: np.ndarray,
+    upper: np.ndarray,
+) -> _Settled:
+    """|det A| / scale bounded from below, over each box."""
+    middle, half = _halved(lower, upper)
+    at_middle = box.enclosed(_matrix, middle, middle)
+    slopes = box.enclosed(_matrix_slopes, lower, upper)
+    near = at_middle.middle
+    signs = np.sign(np.linalg.det(near))
+    inverse = thin(np.linalg.inv(np.where((signs != 0)[:, None, None], near, np.eye(box.n))))
+    changes = times(absolute(matrix_product(inverse, slopes)), thin(half[:, None, None, :])).upper
+    change = total(thin(changes), axis=3).upper
+    off = minus(matrix_product(inverse, at_middle), thin(np.eye(box.n)))
+    off = plus(off, Interval(-change, change))  # C A - 1
+    det = np.fmax(determinant(plus(off, thin(np.eye(box.n)))).lower, _dominant(absolute(off).upper))
+    of_inverse = absolute(determinant(inverse)).upper
+    unit = box.enclosed(lambda mech, home, v: scale(v), lower, upper) if callable(scale) else thin(scale)
+    bound = over(thin(det), times(thin(of_inverse), unit)).lower
+    is_done = bound > least
+    if within:
+        is_done |= box.enclosed(_Margins(within), lower, upper).upper.min(axis=1) < 0
+        bound = np.where(is_done & ~(bound > least), np.inf, bound)
+    is_lost = not within and bool(np.any(signs * sign <= 0))  # det A changes its sign in the box
+    return _Settled(bound, is_done, changes.sum(axis=(1, 2)), is_lost)
+
+
+def _dominant(size: np.ndarray) -> np.ndarray:
+    """A lower bound of |det(1 + D)| where |D| <= size (k, n, n): (1 - r)^n, r >= the spectral radius."""
+    n = size.shape[-1]
+    x = np.ones(size.shape[:2])
+    for _ in range(20):  # towards the eigenvector of Perron; any positive x is as right
+        x = np.einsum("kij,kj->ki", size, x) + 1e-9
+        x /= x.max(axis=1, keepdims=True)
+    rows = total(times(thin(size), thin(x[:, None, :])), axis=2)
+    radius = over(rows, thin(x)).upper.max(axis=1)
+    rest = minus(1.0, thin(radius))
+    return np.where(radius < 1, power(rest, n).lower, np.nan)
+
+
+# --- one box: some margin is negative
+
+
+def _excluded(
+    box: _Box, within: tuple[str, ...] | None, least: float, lower: np.ndarray, upper: np.ndarray
+) -> _Settled:
+    """A bound of how negative the least margin is, over each box."""
+    middle, half = _halved(lower, upper)
+    function = _Margins(within)
+    natural, at_middle = (box.enclosed(function, *ends) for ends in ((lower, upper), (middle, middle)))
+    slopes = box.enclosed(function.slopes, lower, upper)  # (k, margins, d)
+    weights = _weights(at_middle.middle, slopes.middle, half)
+    of_slopes = total(times(thin(weights[:, :, None]), slopes), axis=1)
+    changes = times(absolute(of_slopes), thin(half)).upper
+    value = plus(total(times(thin(weights), at_middle), axis=1), total(thin(changes), axis=1))
+    # the weights sum up to 1 but for roundoff, and so does what they weigh
+    combined = over(value, total(thin(weights), axis=1)).upper
+    bound = -np.fmin(natural.upper.min(axis=1), combined)
+    is_lost = bool(np.any(at_middle.lower.min(axis=1) >= -least))
+    return _Settled(bound, bound > least, changes, is_lost)
+
+
+def _weights(values: np.ndarray, slopes: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Weights >= 0 of margins, sum 1, whose weighted sum is least at its greatest over a box. (k, margins)
+
+    Minimizes w . values + sum_d half_d |w . slopes_d| by exponentiated gradients; whatever they are, the
+    bound that is made with them holds.
+    """
+    of_half = np.abs(slopes) @ half[:, :, None]
+    size = np.abs(values).max(axis=1, keepdims=True) + of_half[:, :, 0].max(axis=1, keepdims=True)
+    now = np.full(values.shape, 1 / values.shape[1])
+    best, least = now, np.full(len(values), np.inf)
+    for step in range(60):
+        along = np.einsum("km,kmd->kd", now, slopes)
+        reached = np.sum(now * values, axis=1) + np.sum(half * np.abs(along), axis=1)
+        is_better = reached < least
+        least, best = np.where(is_better, reached, least), np.where(is_better[:, None], now, best)
+        gradient = values + np.einsum("kmd,kd->km", slopes, half * np.sign(along))
+        now = now * np.exp(-20 / np.sqrt(step + 1) * gradient / size)
+        now = now / now.sum(axis=1, keepdims=True)
+    return best
+
+
+class _Margins:
+    """The margins of some names, as a function of coordinates. -> (margins,)"""
+
+    def __init__(self, names: tuple[str, ...] | None) -> None:
+        self.names = names
+
+    def __call__(self, mech: Mechanism, home: Any, values: jax.Array) -> jax.Array:
+        return _margins(mech, home, values, self.names)
+
+    def slopes(self, mech: Mechanism, home: Any, values: jax.Array) -> jax.Array:
+        return _margin_slopes(mech, home, values, self.names)
+
+
+@partial(jax.jit, static_argnums=3)
+def _margins(mech, home, values, names):
+    pose = _pose_at(home[0], values)
+    free = values[values.shape[0] - type(mech).free_joints :] if type(mech).free_joints else None
+    found = mech.margins(pose, mech.inverse(pose, free=free))
+    return jnp.concatenate([jnp.ravel(found[name]) for name in (found if names is None else names)])
+
+
+@partial(jax.jit, static_argnums=3)
+def _margin_slopes(mech, home, values, names):
+    return jax.jacfwd(lambda v: _margins(mech, home, v, names))(values)
+
+
+# --- bisection
+
+
+def _bisected(
+    box: _Box,
+    settle: Callable[[np.ndarray, np.ndarray], _Settled],
+    starts: Sequence[tuple[np.ndarray, np.ndarray]],
+    most: int,
+    report: Report | None,
+    what: str,
+) -> Certificate:
+    """Settle the boxes, those that are not in two halves, until none is left."""
+    say = report or (lambda *_: None)
+    most = checks.is_count("most", most, most=10**9)
+    lower, upper = (np.stack(ends) for ends in zip(*starts, strict=True))
+    bound, examined, is_lost = np.inf, 0, False
+    while len(lower) and examined < most and not is_lost:
+        here = slice(max(len(lower) - AT_A_TIME, 0), len(lower))  # the last ones: depth first, few are kept
+        low, high = lower[here], upper[here]
+        found = settle(low, high)
+        examined += len(low)
+        is_lost = found.is_lost
+        bound = min(bound, np.min(found.bound[found.is_done], initial=np.inf))
+        open_low, open_high = low[~found.is_done], high[~found.is_done]
+        spread = np.where(open_high > open_low, found.spread[~found.is_done], -1.0)
+        spread = np.where(np.isnan(spread), np.inf, spread)
+        rows, axis = np.arange(len(open_low)), np.argmax(spread, axis=1)
+        cut = _halved(open_low, open_high)[0][rows, axis]
+        below, above = open_high.copy(), open_low.copy()
+        below[rows, axis] = above[rows, axis] = cut
+        lower = np.concatenate([lower[: here.start], open_low, above])
+        upper = np.concatenate([upper[: here.start], below, open_high])
+        say(f"{what}: boxes", examined, examined + len(lower))
+    is_proved = not len(lower)
+    return Certificate(
+        is_proved, float(bound) if is_proved else np.nan, examined, box.names, *box.whole, (lower, upper)
+    )
+
+
+def _halved(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A point of each box near its middle, and how far from it the box reaches at most."""
+    middle = Interval(lower, upper).middle
+    ends = [minus(thin(upper), thin(middle)).upper, minus(thin(middle), thin(lower)).upper]
+    return middle, np.where(upper > lower, np.maximum(*ends), 0.0)

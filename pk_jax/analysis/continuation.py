@@ -50,7 +50,9 @@ class Piece(NamedTuple):
 class Follower:
     """Finds and follows the curves of one kind over one slice."""
 
-    def __init__(self, mech: Mechanism, where: Slice, kind: str, length: jax.Array, nodes: int) -> None:
+    def __init__(
+        self, mech: Mechanism, where: Slice, kind: str, length: jax.Array, nodes: int, free: jax.Array | None
+    ) -> None:
         self.mech, self.where, self.kind, self.length = mech, where, kind, length
         self.d = len(where.axes)
         pose, joints = home_shapes(mech)
@@ -65,7 +67,8 @@ class Follower:
             motions = mech.actuated_rows
         self.scale = jnp.asarray(np.concatenate([box, of_joints, np.ones(motions)]), dtype)
         self.cell = 1 / (nodes - 1)
-        self.given = mech, where.at, length, self.scale
+        at_home = mech.home()[1][self.m - type(mech).free_joints :]
+        self.given = mech, Held(where.at, at_home if free is None else free), length, self.scale
         self.problem = Problem(where.axes, kind, self.m)
 
     def pieces(self, starts: np.ndarray, say: Report) -> list[Piece]:
@@ -164,6 +167,13 @@ class Follower:
         return kept
 
 
+class Held(NamedTuple):
+    """What does not vary: the other coordinates of the pose, and kinematically redundant joints."""
+
+    pose: Any
+    free: jax.Array
+
+
 class Problem(NamedTuple):
     """What is solved, known when compiling: the axes that vary, "I" or "II", the number of joints."""
 
@@ -179,25 +189,29 @@ def _matrix(mech: Mechanism, pose: Any, joints: jax.Array, length: jax.Array, ki
 
 
 def _system(
-    mech: Mechanism, at: Any, length: jax.Array, scale: jax.Array, problem: Problem, y: jax.Array
+    mech: Mechanism, held: Held, length: jax.Array, scale: jax.Array, problem: Problem, y: jax.Array
 ) -> jax.Array:
     """What a singular configuration fulfils; y = (coordinates, joints, motion) / scale."""
     d, m = len(problem.axes), problem.joints
     values, joints, motion = jnp.split(y * scale, (d, d + m))
-    pose = pose_on(at, problem.axes, values)
+    pose = pose_on(held.pose, problem.axes, values)
     size = lax.stop_gradient(rows_and_sizes(mech, pose, joints, length)[2])
     free = _matrix(mech, pose, joints, length, problem.kind) @ motion
-    return jnp.concatenate([mech.residual(pose, joints) / size, free, (motion @ motion - 1)[None] / 2])
+    count = held.free.shape[0]
+    locked = (joints[m - count :] - held.free) / scale[d + m - count : d + m]
+    return jnp.concatenate(
+        [mech.residual(pose, joints) / size, free, (motion @ motion - 1)[None] / 2, locked]
+    )
 
 
 @partial(jax.jit, static_argnums=5)
-def _polish(mech, at, length, scale, starts, problem):
+def _polish(mech, held, length, scale, starts, problem):
     """Gauss-Newton from nodes (batch, d + m): starts and ends in scaled variables, and |system| there."""
-    system = partial(_system, mech, at, length, scale, problem)
+    system = partial(_system, mech, held, length, scale, problem)
 
     def one(start):
         values, joints = jnp.split(start, (len(problem.axes),))
-        matrix = _matrix(mech, pose_on(at, problem.axes, values), joints, length, problem.kind)
+        matrix = _matrix(mech, pose_on(held.pose, problem.axes, values), joints, length, problem.kind)
         y = jnp.concatenate([start, jnp.linalg.svd(matrix)[2][-1]]) / scale
 
         def is_off(state):
@@ -234,9 +248,9 @@ class _Walk(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=6)
-def _begun(mech, at, length, scale, start, way, problem):
+def _begun(mech, held, length, scale, start, way, problem):
     """The walk that leaves a point of a curve one way, or that is over where there is no curve."""
-    jacobian = jax.jacfwd(partial(_system, mech, at, length, scale, problem))(start)
+    jacobian = jax.jacfwd(partial(_system, mech, held, length, scale, problem))(start)
     _, sigma, rows = jnp.linalg.svd(jacobian)
     is_curve = sigma[-1] > 1e-7 * sigma[0] if sigma.shape[0] < start.shape[0] else jnp.asarray(False)
     zero, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
@@ -244,10 +258,10 @@ def _begun(mech, at, length, scale, start, way, problem):
 
 
 @partial(jax.jit, static_argnums=8)
-def _follow(mech, at, length, scale, lower, upper, start, walk, problem):
+def _follow(mech, held, length, scale, lower, upper, start, walk, problem):
     """Along the curve that passes `start` until the box ends or it closes: points, how many, the walk."""
     d, m = len(problem.axes), problem.joints
-    system = partial(_system, mech, at, length, scale, problem)
+    system = partial(_system, mech, held, length, scale, problem)
     is_angle = np.asarray(mech.joint_units or (1,) * m) == 0
     sized = jnp.abs if mech.joints_are_distances else lambda q: q
 

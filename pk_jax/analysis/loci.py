@@ -18,7 +18,7 @@ from pk_jax.analysis.continuation import EXACT, Follower, Piece, Report
 from pk_jax.analysis.singularity import SingularityKind, classify_singularity
 from pk_jax.analysis.slices import BLOCK, joints_of, poses_on, slice_of
 from pk_jax.kinematics.batching import home_shapes
-from pk_jax.kinematics.inverse import branch_rows, working_modes
+from pk_jax.kinematics.inverse import branch_rows, free_rows, working_modes
 from pk_jax.kinematics.jacobian import pose_jacobian
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
@@ -66,6 +66,7 @@ def singularity_locus(
     at: Any = None,
     ranges: Any = None,
     branch: Any = None,
+    free: Any = None,
     kinds: Sequence[str] = ("I", "II"),
     nodes: int | None = None,
     length: Any = None,
@@ -79,7 +80,9 @@ def singularity_locus(
     at:      pose with the other coordinates; default: home
     ranges:  ((lower, upper), ...) of the axes; default: what the mechanism reaches
     branch:  one working mode; default: all of them
-    kinds:   which of "I", "II"
+    free:    values (k,) of the kinematically redundant joints, where the mechanism has some; default: as
+             at home
+    kinds:   which of "I", "II"; I is not sought where joints are kinematically redundant
     nodes:   of the grid, along each axis: features smaller than its cells may be missed
     length:  what lengths are measured in; default `mech.length()`
     report:  called with (what, done, total)
@@ -88,7 +91,7 @@ def singularity_locus(
     sign, the points are found too: the search looks for least singular values, not for signs.
     """
     require_mechanism("singularity_locus", mech)
-    if not checks.is_concrete((mech, at, branch, length)):
+    if not checks.is_concrete((mech, at, branch, free, length)):
         raise ValueError("singularity_locus works on known values only; see singularity_distance")
     if mech.length().dtype != jnp.float64:
         raise ValueError(
@@ -105,6 +108,10 @@ def singularity_locus(
     modes = working_modes(mech)
     if branch is not None:
         modes = np.asarray(branch_rows(mech, branch)[0]).reshape(1, -1)
+    if free is not None:
+        free, many = free_rows(mech, free)
+        if many:
+            raise ValueError("free must be one value of each joint, got a batch")
     say = report or (lambda *_: None)
 
     lines, poses = where.grid(nodes)
@@ -112,7 +119,7 @@ def singularity_locus(
     inverse, direct, joints = [], [], []
     for number, mode in enumerate(modes):
         say("grid, working mode", number, len(modes))
-        q = joints_of(mech, poses, mode)
+        q = joints_of(mech, poses, mode, free)
         found = classify_singularity(mech, poses, q, length=length)
         is_there = np.asarray(found.status) == Status.OK
         inverse.append(np.where(is_there, found.sigma_inverse, np.nan).reshape(shape))
@@ -133,7 +140,7 @@ def singularity_locus(
             seeds = np.flatnonzero(_seeds(sigma, kind))
             starts.append(np.concatenate([values[seeds], q[seeds]], axis=1))
         if starts and sum(map(len, starts)):
-            follower = Follower(mech, where, kind, length, nodes)
+            follower = Follower(mech, where, kind, length, nodes, free)
             found = _curves(follower, follower.pieces(np.concatenate(starts), say))
             if branch is not None and modes.size:
                 found = [part for curve in found for part in _in_mode(curve, modes[0])]
@@ -161,6 +168,12 @@ def _curves_of(mech: Mechanism, d: int, kinds: tuple[str, ...]) -> tuple[str, ..
     a = jax.eval_shape(pose_jacobian, mech, pose, joints)
     equations, n = a.shape[0] if mech.actuated_rows is None else mech.actuated_rows, a.shape[1]
     codimension = {"I": 1, "II": equations - n + 1}
+    if mech.free_joints:  # joints always move while the platform stands
+        kinds = tuple(kind for kind in kinds if kind != "I")
+        if not kinds:
+            raise ValueError(
+                f"{type(mech).__name__} has kinematically redundant joints: there is no type I locus"
+            )
     found = tuple(kind for kind in kinds if codimension[kind] >= d - 1)
     if not found:
         raise ValueError(

@@ -83,10 +83,10 @@ def poses_on(at: Any, axes: tuple[int, ...], values: jax.Array) -> Any:
     return jax.vmap(lambda value: pose_on(at, axes, value))(values)
 
 
-def joints_of(mech: Mechanism, poses: Any, branch: np.ndarray | None = None) -> np.ndarray:
+def joints_of(mech: Mechanism, poses: Any, branch: np.ndarray | None = None, free: Any = None) -> np.ndarray:
     """Joints of many poses in one working mode, NaN out of reach, in blocks of one size. -> (batch, m)
 
-    Stretched and folded legs are given, too.
+    Stretched and folded legs are given, too. free: values (k,) of kinematically redundant joints
     """
     if branch is None:
         branch = working_modes(mech)[0]
@@ -98,7 +98,7 @@ def joints_of(mech: Mechanism, poses: Any, branch: np.ndarray | None = None) -> 
         rows = jax.tree.map(lambda leaf, first=first: padded(leaf[first : first + BLOCK], BLOCK), poses)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # far poses are meant
-            found.append(np.asarray(inverse_kinematics(mech, rows, signs).candidate))
+            found.append(np.asarray(inverse_kinematics(mech, rows, signs, free=free).candidate))
     return np.concatenate(found)[:count]
 
 

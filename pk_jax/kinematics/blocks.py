@@ -20,10 +20,12 @@ class Block(NamedTuple):
     joints: tuple[int, ...]
 
 
-def joint_blocks(mech: Mechanism, pose: Any, joints: jax.Array) -> tuple[Block, ...]:
-    """The blocks of B, in the order of their first equation."""
+def joint_blocks(
+    mech: Mechanism, pose: Any, joints: jax.Array, count: int | None = None
+) -> tuple[Block, ...]:
+    """The blocks of B, or of its first `count` columns, in the order of their first equation."""
     leaves, tree = jax.tree.flatten((mech, pose, joints))
-    return _blocks(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves))
+    return _blocks(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), count)
 
 
 def has_one_joint_an_equation(blocks: tuple[Block, ...]) -> bool:
@@ -32,12 +34,12 @@ def has_one_joint_an_equation(blocks: tuple[Block, ...]) -> bool:
 
 
 @lru_cache(maxsize=256)
-def _blocks(tree: Any, leaves: tuple) -> tuple[Block, ...]:
+def _blocks(tree: Any, leaves: tuple, count: int | None) -> tuple[Block, ...]:
     answer = []
 
     def look(*leaves):
         jacobian = entrywise(joint_jacobian, *jax.tree.unflatten(tree, list(map(split, leaves))))
-        answer.extend([not (is_known(item) and item == 0) for item in row] for row in jacobian.rows())
+        answer.extend([not (is_known(item) and item == 0) for item in row[:count]] for row in jacobian.rows())
 
     jax.eval_shape(look, *(jax.ShapeDtypeStruct(*leaf) for leaf in leaves))
     blocks = []

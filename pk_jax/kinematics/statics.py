@@ -18,11 +18,13 @@ import numpy as np
 
 from pk_jax import checks
 from pk_jax.geometry import safe
+from pk_jax.geometry.axis_pose import AxisPose
 from pk_jax.geometry.poses import pose_units, tangent_size
 from pk_jax.kinematics.batching import all_finite, configurations, home_shapes, over_rows, rows_of
 from pk_jax.kinematics.blocks import joint_blocks
+from pk_jax.kinematics.closure import INCONSISTENT_ABOVE
 from pk_jax.kinematics.jacobian import SINGULAR_BELOW, joint_jacobian, pose_jacobian, scaled_jacobians, units
-from pk_jax.mechanisms.base import Mechanism, require_mechanism
+from pk_jax.mechanisms.base import LegMechanism, Mechanism, require_mechanism
 from pk_jax.status import Status
 
 A_COUPLE = 1e-9  # force over moment / length() below which a wrench is a pure couple
@@ -30,7 +32,7 @@ MOST_PRELOADS = 3  # degrees of redundancy that bounds are distributed over
 
 
 class Screws(NamedTuple):
-    """Wrenches of actuators and constraints, batch first."""
+    """Wrenches of actuators and constraints, batch first; see `joint_forces` for what a wrench is."""
 
     lines: jax.Array  # (m, n) unit wrench of each actuator: direction, and moment about the platform's origin
     arms: jax.Array  # (m,) joint force (torque) per unit of that wrench, signed: tau_i = arm_i f_i
@@ -46,6 +48,9 @@ def screws(mech: Mechanism, pose: Any, joints: Any) -> Screws:
     included. The arm of a telescopic leg is 1, that of a driven revolute joint its distance
     from the line, la sin(psi). NaN where the line is none (the tip of a 6-link's arm on its first joint).
 
+    Kinematically redundant joints stand in series with others, here as if they were locked, and add no
+    wrench: their lines and arms are 0.
+
     Where a leg is stretched or folded (type I) its arms are 0 and its lines what they tend to.
     The sign: a line points from the base to the platform in legs whose equation grows with the distance
     from the base, as all of the house do; legs with several motors likewise.
@@ -60,7 +65,9 @@ def joint_forces(mech: Mechanism, pose: Any, joints: Any, wrench: Any) -> jax.Ar
     """Joint forces (torques at angles) with which the actuators exert `wrench` on the platform. -> (m,)
 
     wrench: (n,), power-conjugate to the tangent of the pose: (fx, fy), (fx, fy, moment) or (force, moment),
-    moments about the platform's origin; or (batch, n). Redundant actuation: those of least norm,
+    moments about the platform's origin; for an `AxisPose` the force along the axis and the moment about
+    the base's origin (the rest is borne by the guide); or (batch, n). Kinematically redundant joints
+    bear what the others load them with. Redundant actuation: those of least norm,
     (m,) = J_F^+ W (a joint force counts times length() beside torques, where joints are of both kinds).
     Sensors carry no force. NaN at a type II singularity, where some wrench has no forces, and for
     redundant actuation where the closure equations are dependent; zero at a joint of a type I singularity.
@@ -71,7 +78,8 @@ def joint_forces(mech: Mechanism, pose: Any, joints: Any, wrench: Any) -> jax.Ar
 def platform_wrench(mech: Mechanism, pose: Any, joints: Any, forces: Any) -> jax.Array:
     """The wrench that joint forces (m,) exert on the platform, W = J_F tau. -> (n,)
 
-    Conventions of `joint_forces`. NaN at a type I singularity, where a leg can exert any force.
+    Conventions of `joint_forces`. NaN at a type I singularity, where a leg can exert any force, and where
+    the forces of kinematically redundant joints are not those that the others load them with (to 1e-6).
     """
     return _over("platform_wrench", _platform_wrench, mech, pose, joints, forces=forces)
 
@@ -88,7 +96,8 @@ def preloads(mech: Mechanism, pose: Any, joints: Any) -> jax.Array:
 def stiffness(mech: Mechanism, pose: Any, joints: Any, k: Any) -> jax.Array:
     """Stiffness of the platform, K = J_F diag(k) J_F^T, for joints of stiffness k () or (m,). -> (n, n)
 
-    Actuators without preload; sensors count nothing. NaN at a type I singularity.
+    Actuators without preload; sensors count nothing; a kinematically redundant joint gives way in series
+    with the others, as much as costs least energy. NaN at a type I singularity.
     Source: Gosselin 1990, IEEE Trans. Robotics and Automation 6(3).
     """
     _, joints_like = home_shapes(mech)
@@ -156,8 +165,9 @@ def _rows(mech, arguments, function, are_batched):
 def _screws(mech: Mechanism, pose: Any, joints: jax.Array) -> Screws:
     a, b = pose_jacobian(mech, pose, joints), joint_jacobian(mech, pose, joints)
     unit = units(pose_units(pose, mech.pose_units), a.dtype)
+    forces = _equation_forces(mech, pose, joints, a * unit)
     lines, arms = jnp.zeros((b.shape[1], a.shape[1]), a.dtype), jnp.zeros(b.shape[1], b.dtype)
-    for block in joint_blocks(mech, pose, joints):
+    for block in joint_blocks(mech, pose, joints, bound_joints(mech, joints)):
         rows, columns = np.array(block.equations), np.array(block.joints, int)
         if len(rows) != len(columns):
             raise ValueError(
@@ -167,12 +177,25 @@ def _screws(mech: Mechanism, pose: Any, joints: jax.Array) -> Screws:
         adjugate, det = _adjugate(b[rows][:, columns])
         outward = jnp.asarray((-1.0) ** np.arange(len(rows) - 1, -1, -1), b.dtype)
         wrenches = outward[:, None] * (adjugate @ a[rows])
-        force, moment = safe.norm(wrenches * unit), safe.norm(wrenches * (1 - unit))
+        force, moment = safe.norm(adjugate @ forces[rows]), safe.norm(wrenches * (1 - unit))
         couple = moment / mech.length()
         size = jnp.where(force > A_COUPLE * couple, force, couple)
         lines = lines.at[columns].set(wrenches / size[:, None])
         arms = arms.at[columns].set(-outward * det / size)
     return Screws(lines, arms, a)
+
+
+def _equation_forces(mech: Mechanism, pose: Any, joints: jax.Array, of_pose: jax.Array) -> jax.Array:
+    """The force vector of every closure equation: what A has of translations, or of its leg. -> (c, d)"""
+    if isinstance(pose, AxisPose) and isinstance(mech, LegMechanism):
+        forces = mech.forces(pose, joints)[1]
+        return forces.transpose(1, 0, 2).reshape(of_pose.shape[0], -1)
+    return of_pose
+
+
+def bound_joints(mech: Mechanism, joints: jax.Array) -> int:
+    """How many joints, the first ones, a pose binds; the others are kinematically redundant."""
+    return joints.shape[0] - type(mech).free_joints
 
 
 def _adjugate(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -223,13 +246,25 @@ def _wrenches(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
     lines, arms, _ = _screws(mech, pose, joints)
     unit = units(mech.joint_units or (1,) * joints.shape[0], arms.dtype)
     is_singular = jnp.abs(arms) < SINGULAR_BELOW * mech.length() ** (1 - unit)
-    carries = jnp.arange(joints.shape[0]) < (mech.actuated_rows or joints.shape[0])
+    carries = np.arange(joints.shape[0]) < (mech.actuated_rows or bound_joints(mech, joints))
     per_force = lines / jnp.where(is_singular, jnp.nan, arms)[:, None]
     return jnp.where(carries[:, None], per_force, 0)
 
 
 def _platform_wrench(mech: Mechanism, pose: Any, joints: jax.Array, forces: jax.Array) -> jax.Array:
-    return _wrenches(mech, pose, joints).T @ forces
+    wrench = _wrenches(mech, pose, joints).T @ forces
+    if type(mech).free_joints:
+        borne = _series(mech, pose, joints).T @ forces
+        size = jnp.max(jnp.abs(forces))
+        wrench = jnp.where(jnp.max(jnp.abs(borne)) <= INCONSISTENT_ABOVE * size, wrench, jnp.nan)
+    return wrench
+
+
+def _series(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
+    """Rates of all joints per rate of each kinematically redundant one, the platform at rest. -> (m, k)"""
+    b, bound = joint_jacobian(mech, pose, joints), bound_joints(mech, joints)
+    rates = -jnp.linalg.solve(b[:, :bound], b[:, bound:])
+    return jnp.concatenate([rates, jnp.eye(rates.shape[1], dtype=rates.dtype)])
 
 
 def _preloads(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
@@ -244,7 +279,13 @@ def _preloads(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
 
 def _stiffness(mech: Mechanism, pose: Any, joints: jax.Array, k: jax.Array) -> jax.Array:
     wrenches = _wrenches(mech, pose, joints)
-    return wrenches.T @ (k[:, None] * wrenches)
+    stiff = k[:, None] * wrenches
+    if type(mech).free_joints:  # their rates are those of least energy
+        series = _series(mech, pose, joints)
+        stiff = stiff - k[:, None] * (
+            series @ jnp.linalg.solve(series.T @ (k[:, None] * series), series.T @ stiff)
+        )
+    return wrenches.T @ stiff
 
 
 def _bounded(

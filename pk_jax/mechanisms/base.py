@@ -165,14 +165,17 @@ class LegMechanism(Mechanism):
         return self.legs(place(pose, self.attachments()), joints).reshape(-1)
 
     def linearize(self, pose: Any, joints: jax.Array) -> tuple[jax.Array, jax.Array]:
-        attachments = self.attachments()
-        points = place(pose, attachments)
+        value, forces = self.forces(pose, joints)
+        rows = jnp.einsum("ekd,kdn->ken", forces, place_jacobian(pose, self.attachments()))
+        return value.reshape(-1), rows.reshape(-1, rows.shape[-1])
+
+    def forces(self, pose: Any, joints: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Closure of every leg, and its gradient in the platform point: a force. -> (k, e), (e, k, d)"""
+        points = place(pose, self.attachments())
         value, pull_back = jax.vjp(lambda p: self.legs(p, joints).reshape(points.shape[0], -1), points)
         equations = value.shape[1]  # a leg
         seeds = jnp.broadcast_to(jnp.eye(equations, dtype=value.dtype)[:, None], (equations, *value.shape))
-        forces = jax.vmap(lambda seed: pull_back(seed)[0])(seeds)  # (e, k, d)
-        rows = jnp.einsum("ekd,kdn->ken", forces, place_jacobian(pose, attachments))
-        return value.reshape(-1), rows.reshape(-1, rows.shape[-1])
+        return value, jax.vmap(lambda seed: pull_back(seed)[0])(seeds)
 
 
 def require_mechanism(function: str, mech: Any) -> None:

@@ -8,11 +8,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pk_jax.analysis.certificate import Certificate as Certificate
+    from pk_jax.analysis.certificate import certify_confined as certify_confined
+    from pk_jax.analysis.certificate import certify_regular as certify_regular
     from pk_jax.analysis.indices import LocalIndices as LocalIndices
     from pk_jax.analysis.indices import local_indices as local_indices
     from pk_jax.analysis.loci import LocusCurve as LocusCurve
     from pk_jax.analysis.loci import SingularityLocus as SingularityLocus
     from pk_jax.analysis.loci import singularity_locus as singularity_locus
+    from pk_jax.analysis.redundancy import Redundancy as Redundancy
+    from pk_jax.analysis.redundancy import resolve_redundancy as resolve_redundancy
     from pk_jax.analysis.singularity import Singularity as Singularity
     from pk_jax.analysis.singularity import SingularityKind as SingularityKind
     from pk_jax.analysis.singularity import classify_singularity as classify_singularity
@@ -20,6 +25,10 @@ if TYPE_CHECKING:
     from pk_jax.analysis.workspace import IndexErrors as IndexErrors
     from pk_jax.analysis.workspace import WorkspaceIndices as WorkspaceIndices
     from pk_jax.analysis.workspace import workspace_indices as workspace_indices
+    from pk_jax.analysis.workspace_map import Travel as Travel
+    from pk_jax.analysis.workspace_map import WorkspaceMap as WorkspaceMap
+    from pk_jax.analysis.workspace_map import travel as travel
+    from pk_jax.analysis.workspace_map import workspace_map as workspace_map
     from pk_jax.design.objective import IndexBounds as IndexBounds
     from pk_jax.design.objective import composite_index as composite_index
     from pk_jax.design.optimize import DesignResult as DesignResult
@@ -38,6 +47,7 @@ if TYPE_CHECKING:
     from pk_jax.kinematics.inverse import working_modes as working_modes
     from pk_jax.kinematics.jacobian import joint_jacobian as joint_jacobian
     from pk_jax.kinematics.jacobian import pose_jacobian as pose_jacobian
+    from pk_jax.kinematics.jacobian import self_motions as self_motions
     from pk_jax.kinematics.jacobian import velocity_jacobian as velocity_jacobian
     from pk_jax.kinematics.laws import check_mechanism as check_mechanism
     from pk_jax.kinematics.statics import BoundedForces as BoundedForces
@@ -66,6 +76,11 @@ if TYPE_CHECKING:
     from pk_jax.viz.skeleton import draw as draw
 
 _NAMES = {
+    "pk_jax.analysis.certificate": (
+        "Certificate",
+        "certify_confined",
+        "certify_regular",
+    ),
     "pk_jax.analysis.indices": (
         "LocalIndices",
         "local_indices",
@@ -74,6 +89,10 @@ _NAMES = {
         "LocusCurve",
         "SingularityLocus",
         "singularity_locus",
+    ),
+    "pk_jax.analysis.redundancy": (
+        "Redundancy",
+        "resolve_redundancy",
     ),
     "pk_jax.analysis.singularity": (
         "Singularity",
@@ -85,6 +104,12 @@ _NAMES = {
         "IndexErrors",
         "WorkspaceIndices",
         "workspace_indices",
+    ),
+    "pk_jax.analysis.workspace_map": (
+        "Travel",
+        "WorkspaceMap",
+        "travel",
+        "workspace_map",
     ),
     "pk_jax.design.objective": (
         "IndexBounds",
@@ -117,6 +142,7 @@ _NAMES = {
     "pk_jax.kinematics.jacobian": (
         "joint_jacobian",
         "pose_jacobian",
+        "self_motions",
         "velocity_jacobian",
     ),
     "pk_jax.kinematics.laws": ("check_mechanism",),

@@ -215,9 +215,9 @@ def _pose_at(home: Any, values: jax.Array) -> Any:
 def _matrix(mech: Mechanism, home: Any, values: jax.Array) -> jax.Array:
     """A at coordinates; joints that are not free are NaN, so that none can have a say. -> (n, n)"""
     pose, joints = home
-    bound = joints.shape[0] - type(mech).free_joints
+    bound = joints.shape[0] - mech.free_joints
     unknown = jnp.full(bound, jnp.nan, joints.dtype)
-    joints = jnp.concatenate([unknown, values[values.shape[0] - type(mech).free_joints :]])
+    joints = jnp.concatenate([unknown, values[values.shape[0] - mech.free_joints :]])
     return mech.linearize(_pose_at(pose, values), joints)[1]
 
 
@@ -339,7 +339,7 @@ class _Margins:
 @partial(jax.jit, static_argnums=3)
 def _margins(mech, home, values, names):
     pose = _pose_at(home[0], values)
-    free = values[values.shape[0] - type(mech).free_joints :] if type(mech).free_joints else None
+    free = values[values.shape[0] - mech.free_joints :] if mech.free_joints else None
     found = mech.margins(pose, mech.inverse(pose, free=free))
     return jnp.concatenate([jnp.ravel(found[name]) for name in (found if names is None else names)])
 

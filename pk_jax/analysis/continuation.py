@@ -67,7 +67,7 @@ class Follower:
             motions = mech.actuated_rows
         self.scale = jnp.asarray(np.concatenate([box, of_joints, np.ones(motions)]), dtype)
         self.cell = 1 / (nodes - 1)
-        at_home = mech.home()[1][self.m - type(mech).free_joints :]
+        at_home = mech.home()[1][self.m - mech.free_joints :]
         self.given = mech, Held(where.at, at_home if free is None else free), length, self.scale
         self.problem = Problem(where.axes, kind, self.m)
 

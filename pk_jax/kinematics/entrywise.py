@@ -410,7 +410,9 @@ def _unknown(jaxpr: Jaxpr):
 def _vmapped(function: Callable, tree, leaves: Sequence[Entries], dtype) -> list[Entries]:
     """The fallback: lanes as the last axis of ordinary arrays."""
     lanes = jnp.broadcast_shapes(*(jnp.shape(item) for leaf in leaves for item in leaf.items))
-    arrays = [jnp.broadcast_to(stack(leaf), (*leaf.shape, *lanes)).astype(dtype) for leaf in leaves]
+    alike = [jnp.broadcast_to(jnp.zeros((), dtype), lanes)]  # makes every leaf one of lanes
+    arrays = [stack(Entries((len(leaf.items) + 1,), leaf.items + alike))[:-1] for leaf in leaves]
+    arrays = [a.reshape(*leaf.shape, *lanes).astype(dtype) for a, leaf in zip(arrays, leaves, strict=True)]
     for _ in lanes:
         function = jax.vmap(function, in_axes=-1, out_axes=-1)
     found = jax.tree.leaves(function(*jax.tree.unflatten(tree, arrays)))

@@ -60,7 +60,7 @@ def inverse_kinematics(
 
 def free_rows(mech: Mechanism, free: Any) -> tuple[jax.Array, bool]:
     """Values of the kinematically redundant joints, (k,) or (batch, k), in all forms that users give."""
-    count = type(mech).free_joints
+    count = mech.free_joints
     if not count:
         raise ValueError(f"free must be left out: {type(mech).__name__} has no kinematically redundant joint")
     array = checks.real_array("free", free)
@@ -118,7 +118,7 @@ def _one(mech: Mechanism, pose: jax.Array, branch: Any = None, free: Any = None)
     is_given = all_finite(pose) & is_pose(pose)
     is_mode = True if branch is None else jnp.all(jnp.abs(branch) == 1)
     if free is not None:
-        at_home = home_joints[home_joints.shape[0] - type(mech).free_joints :]
+        at_home = home_joints[home_joints.shape[0] - mech.free_joints :]
         is_given &= all_finite(free) & (jnp.all(free > 0) if mech.joints_are_distances else True)
         free = jnp.where(is_given, free, at_home)
     pose = settle(where(is_given, pose, home_pose))  # lost rows work on the home pose and are masked after
@@ -158,7 +158,7 @@ def _by_newton(mech: Mechanism, pose: jax.Array, free: Any = None) -> jax.Array:
     """Joints from the residual alone; NaN where Newton did not end on a root. -> (m,)"""
     fixed, at = lax.stop_gradient((mech, pose))
     start = fixed.home()[1]
-    count = start.shape[0] - type(mech).free_joints  # the others stay where they are
+    count = start.shape[0] - mech.free_joints  # the others stay where they are
     held = start[count:] if free is None else free
     whole = lambda q, held: jnp.concatenate([q, held])
     add = lambda joints, step: joints + step

@@ -29,6 +29,8 @@ def joint_jacobian(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
 def velocity_jacobian(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
     """J with x' = J q': -A^-1 B (eq. 8), or the pseudo-inverse of -B^-1 A when c > n. -> (n, m)
 
+    The rates of kinematically redundant joints count like all others.
+
     Not finite at a singular configuration: a type II singularity of A, or of B when c > n.
     """
     a = pose_jacobian(mech, pose, joints)
@@ -36,6 +38,18 @@ def velocity_jacobian(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Arra
     if a.shape[0] == a.shape[1]:
         return -jnp.linalg.solve(a, b)
     return jnp.linalg.pinv(-jnp.linalg.solve(b, a))
+
+
+@jax.jit
+def self_motions(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
+    """Joint rates that leave the platform at rest, each redundant joint at rate 1 in a row. -> (k, m)
+
+    k is the number of kinematically redundant joints. Not finite where a leg is at a type I singularity.
+    """
+    b = joint_jacobian(mech, pose, joints)
+    bound = b.shape[1] - mech.free_joints
+    rates = -jnp.linalg.solve(b[:, :bound], b[:, bound:])
+    return jnp.concatenate([rates.T, jnp.eye(mech.free_joints, dtype=rates.dtype)], axis=1)
 
 
 class ScaledJacobians(NamedTuple):

@@ -76,6 +76,12 @@ def _check_contract(mech: Mechanism, name: str) -> None:
             raise ValueError(
                 f"{name}.{attribute} must be {count} numbers, 1 = length and 0 = angle, got {units}"
             )
+    if m - mech.free_joints > c:
+        raise ValueError(
+            f"{name} has {m} joints in {c} closure equations: the last {m - c} must be its free_joints"
+        )
+    if mech.free_joints and (shape := mech.free_range().shape) != (mech.free_joints, 2):
+        raise ValueError(f"{name}.free_range must have shape {(mech.free_joints, 2)}, got {shape}")
     f, a = jax.eval_shape(mech.linearize, pose, joints)  # shapes alone: op by op it would be slow
     if f.shape != (c,) or a.shape != (c, n):
         raise ValueError(

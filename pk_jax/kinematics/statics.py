@@ -23,7 +23,14 @@ from pk_jax.geometry.poses import pose_units, tangent_size
 from pk_jax.kinematics.batching import all_finite, configurations, home_shapes, over_rows, rows_of
 from pk_jax.kinematics.blocks import joint_blocks
 from pk_jax.kinematics.closure import INCONSISTENT_ABOVE
-from pk_jax.kinematics.jacobian import SINGULAR_BELOW, joint_jacobian, pose_jacobian, scaled_jacobians, units
+from pk_jax.kinematics.jacobian import (
+    SINGULAR_BELOW,
+    joint_jacobian,
+    pose_jacobian,
+    scaled_jacobians,
+    self_motions,
+    units,
+)
 from pk_jax.mechanisms.base import LegMechanism, Mechanism, require_mechanism
 from pk_jax.status import Status
 
@@ -167,7 +174,7 @@ def _screws(mech: Mechanism, pose: Any, joints: jax.Array) -> Screws:
     unit = units(pose_units(pose, mech.pose_units), a.dtype)
     forces = _equation_forces(mech, pose, joints, a * unit)
     lines, arms = jnp.zeros((b.shape[1], a.shape[1]), a.dtype), jnp.zeros(b.shape[1], b.dtype)
-    for block in joint_blocks(mech, pose, joints, bound_joints(mech, joints)):
+    for block in joint_blocks(mech, pose, joints, b.shape[1] - mech.free_joints):
         rows, columns = np.array(block.equations), np.array(block.joints, int)
         if len(rows) != len(columns):
             raise ValueError(
@@ -191,11 +198,6 @@ def _equation_forces(mech: Mechanism, pose: Any, joints: jax.Array, of_pose: jax
         forces = mech.forces(pose, joints)[1]
         return forces.transpose(1, 0, 2).reshape(of_pose.shape[0], -1)
     return of_pose
-
-
-def bound_joints(mech: Mechanism, joints: jax.Array) -> int:
-    """How many joints, the first ones, a pose binds; the others are kinematically redundant."""
-    return joints.shape[0] - type(mech).free_joints
 
 
 def _adjugate(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -246,25 +248,18 @@ def _wrenches(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
     lines, arms, _ = _screws(mech, pose, joints)
     unit = units(mech.joint_units or (1,) * joints.shape[0], arms.dtype)
     is_singular = jnp.abs(arms) < SINGULAR_BELOW * mech.length() ** (1 - unit)
-    carries = np.arange(joints.shape[0]) < (mech.actuated_rows or bound_joints(mech, joints))
+    carries = np.arange(joints.shape[0]) < (mech.actuated_rows or joints.shape[0] - mech.free_joints)
     per_force = lines / jnp.where(is_singular, jnp.nan, arms)[:, None]
     return jnp.where(carries[:, None], per_force, 0)
 
 
 def _platform_wrench(mech: Mechanism, pose: Any, joints: jax.Array, forces: jax.Array) -> jax.Array:
     wrench = _wrenches(mech, pose, joints).T @ forces
-    if type(mech).free_joints:
-        borne = _series(mech, pose, joints).T @ forces
+    if mech.free_joints:
+        borne = self_motions(mech, pose, joints) @ forces
         size = jnp.max(jnp.abs(forces))
         wrench = jnp.where(jnp.max(jnp.abs(borne)) <= INCONSISTENT_ABOVE * size, wrench, jnp.nan)
     return wrench
-
-
-def _series(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
-    """Rates of all joints per rate of each kinematically redundant one, the platform at rest. -> (m, k)"""
-    b, bound = joint_jacobian(mech, pose, joints), bound_joints(mech, joints)
-    rates = -jnp.linalg.solve(b[:, :bound], b[:, bound:])
-    return jnp.concatenate([rates, jnp.eye(rates.shape[1], dtype=rates.dtype)])
 
 
 def _preloads(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
@@ -280,8 +275,8 @@ def _preloads(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
 def _stiffness(mech: Mechanism, pose: Any, joints: jax.Array, k: jax.Array) -> jax.Array:
     wrenches = _wrenches(mech, pose, joints)
     stiff = k[:, None] * wrenches
-    if type(mech).free_joints:  # their rates are those of least energy
-        series = _series(mech, pose, joints)
+    if mech.free_joints:  # their rates are those of least energy
+        series = self_motions(mech, pose, joints).T
         stiff = stiff - k[:, None] * (
             series @ jnp.linalg.solve(series.T @ (k[:, None] * series), series.T @ stiff)
         )

@@ -13,11 +13,22 @@ from matplotlib.lines import Line2D
 
 from pk_jax.analysis.loci import SingularityLocus
 from pk_jax.analysis.singularity import SingularityKind, classify_singularity, scaled_rows
-from pk_jax.geometry.poses import pose_units, position
+from pk_jax.geometry.axis_pose import AxisPose
+from pk_jax.geometry.poses import place, pose_units, position
 from pk_jax.kinematics.statics import screws
-from pk_jax.mechanisms.base import Mechanism
+from pk_jax.mechanisms.base import LegMechanism, Mechanism
 from pk_jax.viz.skeleton import draw
-from pk_jax.viz.style import BLUE, GREEN, INK, SOFT, VERMILION, axes_or_new, new_figure, panel_title
+from pk_jax.viz.style import (
+    BLUE,
+    GREEN,
+    INK,
+    SOFT,
+    VERMILION,
+    axes_or_new,
+    axis_label,
+    new_figure,
+    panel_title,
+)
 
 MOST_PANELS = 16
 _COLORS = {SingularityKind.TYPE_I: INK, SingularityKind.TYPE_II: VERMILION}
@@ -40,25 +51,20 @@ def draw_screws(mech: Mechanism, pose: Any, joints: jax.Array, ax: Axes | None =
     """One configuration with the line of action of every actuator (blue, dashed).
 
     At a type II singularity the motion that stays free with the actuators locked is drawn too: the pole that
-    the platform turns about (a cross), or the direction that it slides in (an arrow). The lines go
-    through the platform's origin where the pose has no turn.
+    the platform turns about (a cross), the direction that it slides in (an arrow), or the axis through
+    the base's origin of an `AxisPose`. The lines go through the platform's origin where the pose has no turn.
     """
     ax = draw(mech, pose, joints, ax)
-    lines = np.asarray(screws(mech, pose, joints).lines)
-    at = np.asarray(position(pose))
     points = np.asarray(mech.skeleton(pose, joints).points)
     d = points.shape[1]
     centre, size = (points.max(0) + points.min(0)) / 2, np.ptp(points, axis=0).max()
-    origin = np.append(at, np.zeros(d))[:d]
-    for line in lines:
-        force = line[:d]
-        if not np.isfinite(line).all() or np.linalg.norm(force) < 0.5:
-            continue  # a pure couple has no line
-        foot = origin + _foot(force, line[d:])
+    reach = 3 * size if d == 2 else 0.75 * size  # in the plane the frame cuts it
+    for foot, force in _lines(mech, pose, joints, d):
         middle = foot + (centre - foot) @ force * force  # the part of the line that is in sight
-        reach = 3 * size if d == 2 else 0.75 * size  # in the plane the frame cuts it
         ends = middle + np.array([[-reach], [reach]]) * force
         ax.plot(*ends.T, color=BLUE, linewidth=1.1, linestyle=(0, (5, 3)), zorder=2)
+    if isinstance(pose, AxisPose):
+        _draw_free_axis(mech, pose, joints, ax, size)
     if d == 2:
         pole = _draw_free_motion(mech, pose, joints, ax, size)
         if pole is not None and np.max(np.abs(pole - centre)) < 1.5 * size:
@@ -67,6 +73,35 @@ def draw_screws(mech: Mechanism, pose: Any, joints: jax.Array, ax: Axes | None =
         ax.set_xlim(points[:, 0].min() - margin, points[:, 0].max() + margin)
         ax.set_ylim(points[:, 1].min() - margin, points[:, 1].max() + margin)
     return ax
+
+
+def _lines(mech: Mechanism, pose: Any, joints: jax.Array, d: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """A point and the unit direction of the line of every actuator; pure couples have none."""
+    if isinstance(pose, AxisPose):  # its wrenches do not tell what the guide bears
+        if not isinstance(mech, LegMechanism):
+            return []
+        forces = np.asarray(mech.forces(pose, joints)[1])
+        points = np.broadcast_to(place(pose, mech.attachments()), forces.shape)
+        found = zip(points.reshape(-1, d), forces.reshape(-1, d), strict=True)
+        return [(point, force / np.linalg.norm(force)) for point, force in found]
+    origin = np.append(np.asarray(position(pose)), np.zeros(d))[:d]
+    found = []
+    for line in np.asarray(screws(mech, pose, joints).lines):
+        if np.isfinite(line).all() and np.linalg.norm(line[:d]) > 0.5:
+            found.append((origin + _foot(line[:d], line[d:]), line[:d]))
+    return found
+
+
+def _draw_free_axis(mech: Mechanism, pose: AxisPose, joints: jax.Array, ax: Axes, size: float) -> None:
+    """The axis through O of the turn that locked actuators leave free, at a type II singularity."""
+    kind = classify_singularity(mech, pose, joints).kind
+    if kind not in (SingularityKind.TYPE_II, SingularityKind.TYPE_III):
+        return
+    a = np.asarray(scaled_rows(mech, pose, joints, mech.length())[0])
+    turn = np.linalg.svd(a)[2][-1][1:]
+    if np.linalg.norm(turn) > 1e-3:
+        ends = np.array([[-0.6], [0.6]]) * size * turn / np.linalg.norm(turn)
+        ax.plot(*ends.T, color=VERMILION, linewidth=2.0, linestyle="-.", zorder=5)
 
 
 def _foot(force: np.ndarray, moment: np.ndarray) -> np.ndarray:
@@ -107,7 +142,9 @@ def singular_configurations(cases: Sequence[Any], columns: int = 4) -> Figure:
     figure = new_figure(3.3 * columns, 3.1 * rows)
     figure.set_layout_engine("constrained")  # panels of many shapes
     for number, case in enumerate(cases, 1):
-        ax = draw_screws(case.mechanism, case.pose, case.joints, figure.add_subplot(rows, columns, number))
+        points = case.mechanism.skeleton(case.pose, case.joints).points
+        panel = figure.add_subplot(rows, columns, number, projection="3d" if points.shape[1] == 3 else None)
+        ax = draw_screws(case.mechanism, case.pose, case.joints, panel)
         found = classify_singularity(case.mechanism, case.pose, case.joints)
         label = f"Fig. {case.figure}: " if case.figure else ""
         ax.set_title(f"{label}{case.title}\n{kind_name(found.kind)}", fontsize="small")
@@ -124,7 +161,7 @@ def draw_locus(mech: Mechanism, locus: SingularityLocus, *, unit: str = "", scal
     labelled with `unit`.
     """
     scales = np.where(locus.units, scale, np.pi / 180)
-    labels = [_label(n, u, unit) for n, u in zip(locus.axes, locus.units, strict=True)]
+    labels = [axis_label(n, u, unit) for n, u in zip(locus.axes, locus.units, strict=True)]
     if len(locus.axes) == 3:
         return _in_space(locus, scales, labels)
     modes = locus.branches[:MOST_PANELS]
@@ -195,10 +232,3 @@ def _in_space(locus: SingularityLocus, scales: np.ndarray, labels: list[str]) ->
 
 def _cycle(count: int) -> list[str]:
     return [(VERMILION, BLUE, GREEN, INK, SOFT)[k % 5] for k in range(count)]
-
-
-def _label(name: str, is_length: int, unit: str) -> str:
-    symbol = {"phi": r"\varphi"}.get(name, name if len(name) == 1 else f"{name[0]}_{{{name[1:]}}}")
-    if not is_length:
-        return f"${symbol}$ (deg)"
-    return f"${symbol}$ ({unit})" if unit else f"${symbol}$"

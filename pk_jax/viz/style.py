@@ -39,6 +39,16 @@ def is_unit(mech: Mechanism) -> bool:
     return bool(np.asarray(mech.half_base) == 1)
 
 
+def axis_label(name: str, is_length: int, unit: str) -> str:
+    """A coordinate with its unit, angles in degrees."""
+    if name in ("roll", "pitch", "yaw"):
+        return f"{name} (deg)"
+    symbol = {"phi": r"\varphi"}.get(name, name if len(name) == 1 else f"{name[0]}_{{{name[1:]}}}")
+    if not is_length:
+        return f"${symbol}$ (deg)"
+    return f"${symbol}$ ({unit})" if unit else f"${symbol}$"
+
+
 def panel_title(ax: Axes, text: str) -> None:
     ax.set_title(text, fontsize="medium", pad=8)
 

@@ -108,6 +108,7 @@ def _convert(options: argparse.Namespace, function: str) -> int:
             options.out,
             columns=options.columns,
             chunk=options.chunk,
+            **({} if options.free is None else {"free": options.free}),
             note=(lambda _: None) if to_terminal else progress.note,
         )
     finally:
@@ -123,7 +124,7 @@ def _jacobian(options: argparse.Namespace) -> int:
     from pk_jax.files.named import named_mechanism
     from pk_jax.files.shown import as_json, as_text, jacobians_at
 
-    found = jacobians_at(named_mechanism(options.mechanism, options.unit), options.pose)
+    found = jacobians_at(named_mechanism(options.mechanism, options.unit), options.pose, options.free)
     print(as_json(found._asdict()) if options.json else as_text(found))
     return 0
 
@@ -138,7 +139,7 @@ def _draw(options: argparse.Namespace) -> int:
 
     named = named_mechanism(options.mechanism, options.unit)
     with output_file(options.out) as file:
-        pose, joints, _ = configuration_at(named, options.pose)
+        pose, joints, _ = configuration_at(named, options.pose, free=options.free)
         axes = draw(named.mechanism, pose, joints)
         axes.set_title(Path(named.name).name)
         if named.path and named.unit != "1":  # those of the catalogue are over a length of reference
@@ -155,6 +156,7 @@ def _singularity(options: argparse.Namespace) -> int:
     from pk_jax.files import singular
     from pk_jax.files.atomic import output_file
     from pk_jax.files.named import named_mechanism
+    from pk_jax.files.options import signs_of
     from pk_jax.files.shown import as_json, configuration_at
     from pk_jax.files.stream import pose_of
     from pk_jax.viz import singularity as viz
@@ -163,7 +165,8 @@ def _singularity(options: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         image = stack.enter_context(output_file(options.out)) if options.out else None
         if options.pose is not None:
-            pose, joints, _ = configuration_at(named, options.pose, singular.signs_of(options.mode))
+            signs = signs_of(options.mode)
+            pose, joints, _ = configuration_at(named, options.pose, signs, options.free)
             found = singular.classified(named, pose, joints, options.tol)
             print(as_json(found) if options.json else singular.classified_text(found))
             if image:
@@ -182,6 +185,7 @@ def _singularity(options: argparse.Namespace) -> int:
             options.kind or ("I", "II"),
             options.nodes,
             progress,
+            options.free,
         )
         progress.close()
         print(singular.locus_text(named, locus))
@@ -192,6 +196,48 @@ def _singularity(options: argparse.Namespace) -> int:
             figure = viz.draw_locus(named.mechanism, locus, unit=unit, scale=named.metres)
             figure.savefig(image, format=kind, dpi=150)
     return 0
+
+
+def _map(options: argparse.Namespace) -> int:
+    kind = _image_kind(options.out) if options.out else None
+    _begin()
+    from pk_jax.files import limits
+    from pk_jax.files.atomic import output_file
+    from pk_jax.files.named import named_mechanism
+    from pk_jax.files.stream import pose_of
+    from pk_jax.viz.workspace_map import draw_map
+
+    named = named_mechanism(options.mechanism, options.unit)
+    with contextlib.ExitStack() as stack:
+        image = stack.enter_context(output_file(options.out)) if options.out else None
+        table = stack.enter_context(output_file(options.csv)) if options.csv else None
+        at = None if options.at is None else pose_of(named, options.at, "--at")
+        found, travels = limits.map_of(
+            named, options.axes, at, options.range, options.mode, options.free, options.nodes
+        )
+        print(limits.map_text(named, found, travels))
+        if table:
+            table.write(limits.map_rows(named, found).encode())
+        if image:
+            unit = "" if named.unit == "1" else named.unit
+            axes = draw_map(found, unit=unit, scale=named.metres)
+            axes.set_title(Path(named.name).name)
+            axes.figure.savefig(image, format=kind, dpi=150)
+    return 0
+
+
+def _certify(options: argparse.Namespace) -> int:
+    progress = _begin()
+    from pk_jax.files import limits
+    from pk_jax.files.named import named_mechanism
+
+    named = named_mechanism(options.mechanism, options.unit)
+    found = limits.certificates_of(
+        named, options.range, options.at_least, options.within, options.most, progress
+    )
+    progress.close()
+    print(limits.certificates_text(named, found, options.at_least))
+    return 0 if all(each.is_proved for each in found.values()) else NUMERICAL
 
 
 def _image_kind(path: str) -> str:
@@ -216,6 +262,13 @@ def _reproduce(options: argparse.Namespace) -> int:
         from pk_jax.papers.planar_screws_report import report_into
 
         is_right = report_into(options.out or "runs/planar-screws", say=progress.say, show=print)
+        progress.close()
+        return 0 if is_right else NUMERICAL
+    if options.paper == "casing-oscillator":
+        from pk_jax.papers.casing_oscillator_report import report_into as casing_into
+
+        out = options.out or "runs/casing-oscillator"
+        is_right = casing_into(out, report=progress, say=progress.say, show=print)
         progress.close()
         return 0 if is_right else NUMERICAL
     from pk_jax.papers.nam2006_report import as_text, reproduce_into
@@ -355,10 +408,11 @@ def _parser() -> argparse.ArgumentParser:
         "paper",
         nargs="?",
         default="nam2006",
-        choices=("nam2006", "planar-screws"),
-        help="default: %(default)s; planar-screws: singular poses and loci of the 5-link, k-RRR and 6-link",
+        choices=("nam2006", "planar-screws", "casing-oscillator"),
+        help="default: %(default)s; planar-screws: singular poses and loci of the 5-link, k-RRR and 6-link; "
+        "casing-oscillator: its workspace, singularities, and the proof that they do not meet",
     )
-    sub.add_argument("--out", metavar="DIR", help="run folder (default: runs/nam2006, runs/planar-screws)")
+    sub.add_argument("--out", metavar="DIR", help="run folder (default: runs/PAPER)")
 
     sub = command("workspace", _workspace, "GII, GRI and SUI of a 2-RPR or 2-RRR")
     sub.add_argument("mechanism", help="2-rpr, 2-rrr, a catalogue entry (see: pk-jax list) or a TOML file")
@@ -377,6 +431,9 @@ def _parser() -> argparse.ArgumentParser:
 
     named = "a catalogue entry (see: pk-jax list) or a TOML file"
     unit = "of lengths: m, mm, cm, in or um (default: the file's own, m for a catalogue entry)"
+    free = (
+        "kinematically redundant joints, or margin or conditioning: what to choose them by (default: home's)"
+    )
     for name, run, rows, text in (
         ("fk", _forward, "joints", "forward kinematics of rows of joints (CSV in, CSV out)"),
         ("ik", _inverse, "poses", "inverse kinematics of rows of poses (CSV in, CSV out)"),
@@ -392,6 +449,10 @@ def _parser() -> argparse.ArgumentParser:
             "--columns", metavar="A,B,...", help=f"which columns are the {rows}: names or numbers"
         )
         sub.add_argument("--unit", help=unit)
+        if rows == "poses":
+            sub.add_argument("--free", metavar="VALUE", help=free)
+        else:
+            sub.set_defaults(free=None)
         sub.add_argument(
             "--chunk", type=int, default=65536, metavar="N", help="rows at a time (default: %(default)s)"
         )
@@ -406,6 +467,7 @@ def _parser() -> argparse.ArgumentParser:
         sub.add_argument("--unit", help=unit)
         if sub is not shown:
             sub.add_argument("--pose", metavar="X,Y,...", help="as a row of ik (default: home)")
+            sub.add_argument("--free", metavar="VALUE", help=free)
 
     sub = command("singularity", _singularity, "where a mechanism is singular, and how far from it a pose is")
     sub.add_argument("mechanism", help=named)
@@ -416,12 +478,12 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "--axes",
         metavar="A,B",
-        help="coordinates of the map, of x, y, z, rx, ry, rz, phi (default: first two)",
+        help="coordinates of the map, of x, y, z, rx, ry, rz, phi; s, roll, pitch, yaw (default: first two)",
     )
     sub.add_argument("--at", metavar="X,Y,...", help="pose with the other coordinates (default: home)")
-    sub.add_argument(
-        "--range", action="append", default=[], metavar="A=LO:HI", help="range of an axis, angles in rad"
-    )
+    span = "range of an axis, angles in rad"
+    sub.add_argument("--range", action="append", default=[], metavar="A=LO:HI", help=span)
+    sub.add_argument("--free", metavar="VALUE", help=f"{free}; of a map: values")
     sub.add_argument(
         "--mode", metavar="+-+", help="one working mode (default: all; with --pose: the mechanism's own)"
     )
@@ -431,6 +493,36 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("-o", "--out", metavar="FILE", help="the map with its loci, a .png, .svg or .pdf")
     sub.add_argument("--csv", metavar="FILE", help="every point of the loci")
+
+    sub = command("map", _map, "the workspace within the limits of all joints: smallest margin, and travels")
+    sub.add_argument("mechanism", help=named)
+    sub.add_argument("--unit", help=unit)
+    sub.add_argument("--axes", metavar="A,B", help="coordinates of the map (default: the first two)")
+    sub.add_argument("--at", metavar="X,Y,...", help="pose with the other coordinates (default: home)")
+    sub.add_argument("--range", action="append", default=[], metavar="A=LO:HI", help=span)
+    sub.add_argument("--mode", metavar="+-+", help="working mode (default: the mechanism's own)")
+    sub.add_argument(
+        "--free", metavar="VALUE", help="kinematically redundant joints, or any (default: home's)"
+    )
+    sub.add_argument("--nodes", type=int, help="of the grid, along each axis (default: 201)")
+    sub.add_argument("-o", "--out", metavar="FILE", help="the map, a .png, .svg or .pdf")
+    sub.add_argument("--csv", metavar="FILE", help="every node of the map")
+
+    sub = command(
+        "certify",
+        _certify,
+        "prove that a box of poses has no singularity, and that limits don't let it be left",
+    )
+    sub.add_argument("mechanism", help=named)
+    sub.add_argument("--unit", help=unit)
+    sub.add_argument(
+        "--range", action="append", default=[], metavar="A=LO:HI", help="of a coordinate or free joint; rad"
+    )
+    sub.add_argument("--at-least", type=float, default=0.0, help="what |det A| over that at home must exceed")
+    sub.add_argument("--within", metavar="A,B", help="margins that limit the poses (default: all)")
+    sub.add_argument(
+        "--most", type=int, default=1_000_000, metavar="N", help="boxes to examine (default: %(default)s)"
+    )
 
     command("list", _list, "the catalogue of published designs")
     return parser

@@ -11,8 +11,14 @@ import numpy as np
 
 from pk_jax.files.mechanism_file import ANGLES, DIRECTIONS, NOT_IN_FILES
 from pk_jax.files.named import Named, source_of
-from pk_jax.files.stream import joint_layouts, joints_columns, output_layout, pose_columns, pose_of
-from pk_jax.kinematics.inverse import inverse_kinematics
+from pk_jax.files.stream import (
+    free_of,
+    joint_layouts,
+    joints_columns,
+    output_layout,
+    pose_columns,
+    pose_of,
+)
 from pk_jax.kinematics.jacobian import joint_jacobian, pose_jacobian, scaled_jacobians, velocity_jacobian
 from pk_jax.status import Status
 
@@ -31,22 +37,24 @@ class Jacobians(NamedTuple):
     sigma_b: float
 
 
-def configuration_at(named: Named, text: str | None, branch: Any = None) -> tuple[Any, jax.Array, Status]:
-    """Home, or the pose that `text` says with its joints. ValueError where it has none."""
-    if text is None:
+def configuration_at(
+    named: Named, text: str | None, branch: Any = None, free: str | None = None
+) -> tuple[Any, jax.Array, Status]:
+    """Home, or the pose that `text` says, with its joints. ValueError where it has none."""
+    if text is None and free is None:
         return *named.mechanism.home(), Status.OK
-    pose = pose_of(named, text)
-    found = inverse_kinematics(named.mechanism, pose, branch)
-    status = Status(int(found.status))
+    pose = named.mechanism.home()[0] if text is None else pose_of(named, text)
+    joints, status = free_of(named, free)(pose, branch)
+    status = Status(int(status))
     if status not in (Status.OK, Status.SINGULAR):  # where a leg is stretched it can be looked at, too
         raise ValueError(f"--pose {text} is {status.name}: there are no joints for it")
-    return pose, found.candidate, status
+    return pose, joints, status
 
 
-def jacobians_at(named: Named, text: str | None) -> Jacobians:
+def jacobians_at(named: Named, text: str | None, free: str | None = None) -> Jacobians:
     """A, B and J at home or at a pose."""
     mech = named.mechanism
-    pose, joints, status = configuration_at(named, text)
+    pose, joints, status = configuration_at(named, text, free=free)
     scaled = scaled_jacobians(mech, pose, joints)
     least = lambda matrix: float(np.linalg.svd(matrix, compute_uv=False)[-1])
     a, b, j = (f(mech, pose, joints) for f in (pose_jacobian, joint_jacobian, velocity_jacobian))

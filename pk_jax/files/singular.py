@@ -10,12 +10,10 @@ import numpy as np
 
 from pk_jax.analysis.loci import SingularityLocus, singularity_locus
 from pk_jax.analysis.singularity import SingularityKind, classify_singularity
-from pk_jax.analysis.slices import coordinate_names
 from pk_jax.files.named import Named
+from pk_jax.files.options import ranges_of, signs_of
 from pk_jax.files.rows_file import format_rows
-from pk_jax.files.stream import joint_layouts, joints_columns, output_layout, pose_columns
-from pk_jax.geometry.poses import pose_units
-from pk_jax.kinematics.batching import home_shapes
+from pk_jax.files.stream import free_numbers, joint_layouts, joints_columns, output_layout, pose_columns
 from pk_jax.kinematics.statics import screws
 
 
@@ -66,21 +64,20 @@ def locus_of(
     kinds: Sequence[str],
     nodes: int | None,
     report: Any,
+    free: str | None = None,
 ) -> SingularityLocus:
     """`singularity_locus` of what the command line says; lengths in the unit of the user, angles in rad."""
     mech = named.mechanism
-    names = coordinate_names(mech)
-    given = dict(_range(text, names) for text in ranges)
+    given = ranges_of(named, ranges)
     chosen = tuple(axes.split(",")) if axes else tuple(given) or None
     box = None
     if given:
         if set(given) != set(chosen or ()):
             raise ValueError(f"--range must be given for each of --axes {','.join(chosen)}, or for none")
-        units = dict(zip(names, pose_units(home_shapes(mech)[0], mech.pose_units), strict=True))
-        box = [[v * (named.metres if units[name] else 1.0) for v in given[name]] for name in chosen]
-    return singularity_locus(
-        mech, chosen, at=at, ranges=box, branch=signs_of(branch), kinds=kinds, nodes=nodes, report=report
-    )
+        box = [given[name] for name in chosen]
+    held = None if free is None else free_numbers(named, free)
+    options = {"branch": signs_of(branch), "free": held, "kinds": kinds, "nodes": nodes}
+    return singularity_locus(mech, chosen, at=at, ranges=box, report=report, **options)
 
 
 def locus_text(named: Named, locus: SingularityLocus) -> str:
@@ -132,27 +129,6 @@ def _names(layout: Any) -> list[str]:
 def _one(columns: Any, named: Named, value: Any) -> list[float]:
     batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], value)
     return [float(number[0]) for number in columns(named, batch)]
-
-
-def _range(text: str, names: tuple[str, ...]) -> tuple[str, tuple[float, float]]:
-    name, _, span = text.partition("=")
-    low, _, high = span.partition(":")
-    try:
-        found = float(low), float(high)
-    except ValueError:
-        raise ValueError(f"--range must be NAME=LOWER:UPPER, got {text!r}") from None
-    if name not in names:
-        raise ValueError(f"--range must name one of {', '.join(names)}, got {name!r}")
-    return name, found
-
-
-def signs_of(mode: str | None) -> list[float] | None:
-    """A working mode from its signs."""
-    if mode is None:
-        return None
-    if not mode or set(mode) - set("+-"):
-        raise ValueError(f"--mode must be signs, like +-+, got {mode!r}")
-    return [1.0 if sign == "+" else -1.0 for sign in mode]
 
 
 def _signs(mode: Any) -> str:

@@ -14,9 +14,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from pk_jax.analysis.redundancy import resolve_redundancy
 from pk_jax.analysis.slices import coordinate_names
 from pk_jax.files.atomic import output_file
-from pk_jax.files.columns import Column, Layout
+from pk_jax.files.columns import Column, Layout, is_number
 from pk_jax.files.named import Named
 from pk_jax.files.rows_file import CHUNK, format_rows, open_rows, parse_row
 from pk_jax.geometry import rotations
@@ -32,6 +33,7 @@ Solve = Callable[[Layout, np.ndarray], tuple[list[Any], np.ndarray]]  # -> colum
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _TURN = {SE3: ("rx", "ry", "rz"), AxisPose: ("roll", "pitch", "yaw")}
+_PLACE = {SE3: 3, AxisPose: 1}  # columns before the turn
 _KINDS = ("angle", "length")
 
 
@@ -43,10 +45,12 @@ def forward_rows(named: Named, source: str, target: str | None, **options: Any) 
     return _stream(named, source, target, joint_layouts(named), header, solve, **options)
 
 
-def inverse_rows(named: Named, source: str, target: str | None, **options: Any) -> Counter[str]:
-    """Joints of the poses in `source`, written to `target`; see `_stream`."""
+def inverse_rows(
+    named: Named, source: str, target: str | None, *, free: str | None = None, **options: Any
+) -> Counter[str]:
+    """Joints of the poses in `source`, written to `target`; see `_stream` and `free_of`."""
     header = [c.name for c in joint_layouts(named)[0]] + ["status"]
-    solve = partial(_inverse, named, _Padding())
+    solve = partial(_inverse, named, _Padding(), free_of(named, free))
     return _stream(named, source, target, pose_layouts(named), header, solve, **options)
 
 
@@ -118,6 +122,12 @@ def joint_layouts(named: Named) -> list[Layout]:
     return [tuple(Column(name, _KINDS[u]) for name, u in zip(each, units, strict=True)) for each in names]
 
 
+def free_columns(named: Named) -> Layout:
+    """The kinematically redundant joints."""
+    layout = joint_layouts(named)[0]
+    return layout[len(layout) - named.mechanism.free_joints :]
+
+
 def pose_layouts(named: Named) -> list[Layout]:
     """Position, then quaternion or rotation vector (`AxisPose`: angles); or what an array pose holds."""
     layout, kind = _position(named), type(home_shapes(named.mechanism)[0])
@@ -136,9 +146,8 @@ def output_layout(named: Named) -> Layout:
 def _position(named: Named) -> Layout:
     pose = home_shapes(named.mechanism)[0]
     units = pose_units(pose, named.mechanism.pose_units)
-    count = position(pose).shape[0] if isinstance(pose, SE3) else 1 if isinstance(pose, AxisPose) else None
     named_units = zip(coordinate_names(named.mechanism), units, strict=True)
-    return tuple(Column(name, _KINDS[u]) for name, u in named_units)[:count]
+    return tuple(Column(name, _KINDS[u]) for name, u in named_units)[: _PLACE.get(type(pose))]
 
 
 def _numbers(names: tuple[str, ...]) -> Layout:
@@ -150,6 +159,43 @@ def _angles(names: tuple[str, ...]) -> Layout:
 
 
 # Rows in units of the user, and the solvers
+
+BEST = ("margin", "conditioning")
+
+
+def free_numbers(named: Named, text: str, words: tuple[str, ...] = ()) -> np.ndarray:
+    """Values of the kinematically redundant joints in m and rad. words: what may be said instead."""
+    layout = free_columns(named)
+    if not layout:
+        raise ValueError(f"--free: {named.name} has no kinematically redundant joint")
+    fields = text.split(",")
+    if len(fields) != len(layout) or not all(map(is_number, fields)):
+        wanted = ",".join(column.name for column in layout)
+        raise ValueError(f"--free must be {' or '.join((f'numbers {wanted}', *words))}, got {text!r}")
+    return np.array([float(field) for field in fields]) * _scale(named, layout)
+
+
+def free_of(named: Named, text: str | None) -> Callable[..., tuple[jax.Array, jax.Array]]:
+    """Inverse kinematics, (pose, branch) -> (joints, status), with the free joints that an option says.
+
+    text: values of the kinematically redundant joints in the unit of the user, or what to choose them
+    by, "margin" or "conditioning"; default: as at home
+    """
+    mech = named.mechanism
+    if text in BEST:
+
+        def solve(pose, branch=None):
+            found = resolve_redundancy(mech, pose, text, branch)
+            return found.joints, found.status
+
+        return solve
+    free = None if text is None else free_numbers(named, text, BEST)
+
+    def solve_at(pose, branch=None):
+        found = inverse_kinematics(mech, pose, branch, free=free)
+        return found.candidate, found.status
+
+    return solve_at
 
 
 def pose_of(named: Named, text: str, option: str = "--pose") -> Any:
@@ -181,22 +227,24 @@ def _forward(named: Named, pad: _Padding, layout: Layout, rows: np.ndarray) -> t
     return [*numbers, _names(status), residual, steps, sigma, signs], status
 
 
-def _inverse(named: Named, pad: _Padding, layout: Layout, rows: np.ndarray) -> tuple[list[Any], np.ndarray]:
-    found = inverse_kinematics(named.mechanism, _as_pose(named, layout, pad(rows)))
-    joints, status = np.asarray(found.joints)[: len(rows)], np.asarray(found.status)[: len(rows)]
+def _inverse(
+    named: Named, pad: _Padding, solve: Callable, layout: Layout, rows: np.ndarray
+) -> tuple[list[Any], np.ndarray]:
+    joints, status = (np.asarray(each)[: len(rows)] for each in solve(_as_pose(named, layout, pad(rows))))
+    joints = np.where((status == Status.OK)[:, None], joints, np.nan)
     return [*joints_columns(named, joints), _names(status)], status
 
 
 def _as_pose(named: Named, layout: Layout, rows: np.ndarray) -> Any:
     rows = rows * _scale(named, layout)
-    home = home_shapes(named.mechanism)[0]
-    if not isinstance(home, Turning):
+    kind = type(home_shapes(named.mechanism)[0])
+    if kind not in _PLACE:
         return rows
-    place, turn = np.split(rows, [position(home).shape[0]], axis=1)
+    place, turn = np.split(rows, [_PLACE[kind]], axis=1)
     if turn.shape[1] == 4:
         with np.errstate(invalid="ignore"):  # a quaternion of zero length is no rotation: NaN, BAD_INPUT
             turn = turn / np.abs(turn).max(axis=1, keepdims=True)
-    return _from_rows(type(home), place, turn)
+    return _from_rows(kind, place, turn)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -92,7 +92,8 @@ def to_angles(r: jax.Array) -> jax.Array:
     flat = r[0, 0] ** 2 + r[1, 0] ** 2
     is_upright = flat < GIMBAL
     cosine = jnp.sqrt(jnp.where(is_upright, 1, flat))
-    pitch = jnp.where(is_upright, jnp.sign(-r[2, 0]) * jnp.pi / 2, jnp.arctan2(-r[2, 0], cosine))
+    down = 0 - r[2, 0]  # not -0
+    pitch = jnp.where(is_upright, jnp.sign(down) * jnp.pi / 2, jnp.arctan2(down, cosine))
     one = jnp.ones_like(flat)
     roll = jnp.where(is_upright, 0, jnp.arctan2(r[2, 1], jnp.where(is_upright, one, r[2, 2])))
     yaw = jnp.where(

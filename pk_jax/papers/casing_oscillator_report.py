@@ -26,6 +26,8 @@ from pk_jax.papers.casing_oscillator import (
 from pk_jax.papers.casing_oscillator_claims import claims
 from pk_jax.viz import casing_oscillator as viz
 from pk_jax.viz.singularity import draw_locus, singular_configurations
+from pk_jax.viz.style import GREEN
+from pk_jax.viz.workspace_map import draw_boundary
 
 SLIDES = (0.43, 0.455, 0.48, 0.505, 0.53)  # m
 WIDE = 20 * DEG
@@ -115,6 +117,14 @@ def _travels(mech: CasingOscillator) -> Any:
         for name in ("pitch", "roll")
     }
     return viz.positional_workspace(slides, spans, CLAIMED)
+
+
+def _locus(mech: CasingOscillator, other: str) -> Any:
+    """The singularities and, small in the middle, what the strokes and cones let the machine reach."""
+    figure = draw_locus(mech, singularity_locus(mech, f"{other},yaw"))
+    found = workspace_map(mech, (other, "yaw"), ranges=[(-WIDE, WIDE)] * 2, free="any")
+    draw_boundary(found, figure.axes[0], color=GREEN, linewidth=2.0)
+    return figure
 
 
 def _orientations(mech: CasingOscillator, other: str) -> Any:

@@ -150,7 +150,7 @@ def singular_configurations(cases: Sequence[Any], columns: int = 4) -> Figure:
         ax.set_title(f"{label}{case.title}\n{kind_name(found.kind)}", fontsize="small")
         ax.tick_params(labelsize=7)
         ax.locator_params(nbins=4)
-        ax.set(xlabel=None, ylabel=None)
+        ax.set(xlabel=None, ylabel=None, **({"zlabel": None} if points.shape[1] == 3 else {}))
     return figure
 
 

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 import pk_jax as pk
 from benchmarks import _peers
 from examples.delta import Delta
-from pk_jax.geometry.poses import retract
+from pk_jax.geometry.poses import retract, tangent_size
 from pk_jax.kinematics import compiled, lane_newton, rows
 
 ROBOT = "semi-regular-stewart"
@@ -250,7 +250,7 @@ def other_mechanisms(count: int = 16_384) -> None:
 def naive(robot: pk.Mechanism, joints: jax.Array):
     """What one writes first: Newton by jacfwd and solve until the step is small, vmapped."""
     home = robot.home()[0]
-    size = 6 if isinstance(home, pk.SE3) else home.size
+    size = tangent_size(home)
 
     def one(q):
         def step(state):

@@ -144,6 +144,7 @@ def test_every_field_of_every_family_is_known_to_be_a_length_or_not():
     not_lengths = {*mechanism_file.ANGLES, *mechanism_file.DIRECTIONS, *mechanism_file.NOT_IN_FILES}
     known = {
         "Stewart": {"base", "platform", "stroke"},
+        "CasingOscillator": {"base_radius", "platform_radius", "neutral", "stroke"},
         "PlanarRRR": {"base", "platform", "proximal", "distal"},
         "PlanarRPR": {"base", "platform", "stroke"},
         "SixLink": {"base", "platform", "proximal", "distal"},

@@ -16,6 +16,7 @@ from pk_jax.kinematics.jacobian import scaled_jacobians
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
 
+WAYS = ("margin", "conditioning", "middle")
 NODES = 17  # of the first search
 HALVINGS = 52
 
@@ -36,6 +37,7 @@ def resolve_redundancy(mech: Mechanism, pose: Any, by: str = "margin", branch: A
     by:      "margin": the smallest of all margins is greatest. The pose is inside all limits for some
              value of the joint just where the result is >= 0.
              "conditioning": the ratio of least to greatest singular value of A without units is greatest
+             "middle": the middle of the range, whatever the pose; the value is the smallest margin
     branch:  working mode, as for `inverse_kinematics`
 
     By a first search on 17 values and bisection on the sign of the derivative: exact where the objective has
@@ -45,15 +47,15 @@ def resolve_redundancy(mech: Mechanism, pose: Any, by: str = "margin", branch: A
     ValueError for a mechanism without exactly one such joint, or without margins for `by="margin"`.
     """
     require_mechanism("resolve_redundancy", mech)
-    if by not in ("margin", "conditioning"):
-        raise ValueError(f'by must be "margin" or "conditioning", got {by!r}')
+    if by not in WAYS:
+        raise ValueError(f"by must be one of {', '.join(WAYS)}, got {by!r}")
     if mech.free_joints != 1:
         raise ValueError(
             f"resolve_redundancy takes mechanisms with one redundant joint, {type(mech).__name__} has "
             f"{mech.free_joints}"
         )
     home_pose, _ = home_shapes(mech)
-    if by == "margin" and not jax.eval_shape(lambda mech: mech.margins(*mech.home()), mech):
+    if by != "conditioning" and not jax.eval_shape(lambda mech: mech.margins(*mech.home()), mech):
         raise ValueError(f"{type(mech).__name__} has no margins to keep")
     pose, many = rows_of("pose", pose, home_pose)
     branch, branches = (None, False) if branch is None else branch_rows(mech, branch)
@@ -66,16 +68,20 @@ def _solve(mech, rows, by, are_batched):
 
 
 def _one(mech: Mechanism, by: str, pose: Any, branch: Any) -> Redundancy:
-    objectives = partial(margins_of if by == "margin" else _conditioning, branch=branch)
-    place = lax.stop_gradient(best_free(*lax.stop_gradient((mech, pose)), objectives))
+    objectives = partial(_conditioning if by == "conditioning" else margins_of, branch=branch)
+    if by == "middle":
+        place = lax.stop_gradient(jnp.mean(mech.free_range()))
+    else:
+        place = lax.stop_gradient(best_free(*lax.stop_gradient((mech, pose)), objectives))
     solved = inverse_kinematics(mech, pose, branch, free=place[None])
     is_ok = solved.status == Status.OK
     home_pose, home_joints = lax.stop_gradient(mech.home())
     safe_pose = jax.tree.map(lambda a, b: jnp.where(is_ok, a, b), pose, home_pose)
     place = jnp.where(is_ok, place, home_joints[-1])
-    free = newton.implicit(
-        partial(_balance, mech, safe_pose, objectives, place), lambda x, step: x + step, place[None], 1
-    )
+    balance = partial(_balance, mech, safe_pose, objectives, place)
+    if by == "middle":
+        balance = lambda free: free - jnp.mean(mech.free_range())
+    free = newton.implicit(balance, lambda x, step: x + step, place[None], 1)
     joints = inverse_kinematics(mech, safe_pose, branch, free=free).joints
     value = jnp.min(objectives(mech, safe_pose, free[0]))
     masked = lambda x: jnp.where(is_ok, x, jnp.nan)

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from pk_jax.analysis.redundancy import resolve_redundancy
+from pk_jax.analysis.redundancy import WAYS, resolve_redundancy
 from pk_jax.analysis.slices import coordinate_names
 from pk_jax.files.atomic import output_file
 from pk_jax.files.columns import Column, Layout, is_number
@@ -160,8 +160,6 @@ def _angles(names: tuple[str, ...]) -> Layout:
 
 # Rows in units of the user, and the solvers
 
-BEST = ("margin", "conditioning")
-
 
 def free_numbers(named: Named, text: str, words: tuple[str, ...] = ()) -> np.ndarray:
     """Values of the kinematically redundant joints in m and rad. words: what may be said instead."""
@@ -179,17 +177,17 @@ def free_of(named: Named, text: str | None) -> Callable[..., tuple[jax.Array, ja
     """Inverse kinematics, (pose, branch) -> (joints, status), with the free joints that an option says.
 
     text: values of the kinematically redundant joints in the unit of the user, or what to choose them
-    by, "margin" or "conditioning"; default: as at home
+    by, one of `WAYS`; default: as at home
     """
     mech = named.mechanism
-    if text in BEST:
+    if text in WAYS:
 
         def solve(pose, branch=None):
             found = resolve_redundancy(mech, pose, text, branch)
             return found.joints, found.status
 
         return solve
-    free = None if text is None else free_numbers(named, text, BEST)
+    free = None if text is None else free_numbers(named, text, WAYS)
 
     def solve_at(pose, branch=None):
         found = inverse_kinematics(mech, pose, branch, free=free)

@@ -238,7 +238,7 @@ WRONG = {
     ),
     "no family": (
         REST,
-        'missing key \'family\', one of "Stewart", "PlanarRRR", "PlanarRPR", "SixLink", "FiveBar", "TwoRPR"$',
+        'missing key \'family\', one of "Stewart", "CasingOscillator", "PlanarRRR", "PlanarRPR", "SixLink", "FiveBar", "TwoRPR"$',
     ),
     "empty": ("", "missing key 'family'"),
     "no unit": (
@@ -407,7 +407,7 @@ def test_only_what_can_be_loaded_is_saved(tmp_path):
         assert str(told.value).startswith(f"{path}: ") and "\n" not in str(told.value)
 
     of_the_house = "only a mechanism of the house can be saved, {}, got ".format(
-        "Stewart, PlanarRRR, PlanarRPR, SixLink, FiveBar, TwoRPR"
+        "Stewart, CasingOscillator, PlanarRRR, PlanarRPR, SixLink, FiveBar, TwoRPR"
     )
     refused(Delta(base_radius=0.2, platform_radius=0.1, arm=0.3, rod=0.5), of_the_house + "Delta$")
     refused(Mine(**fields(good)), of_the_house + "Mine$")

@@ -90,12 +90,10 @@ def certify_regular(
         raise ValueError(
             f"certify_regular needs as many equations as coordinates, {type(mech).__name__} has others"
         )
-    at_home, at_centre = (
-        float(np.linalg.det(_matrix(mech, mech.home(), jnp.asarray(values))))
-        for values in (box.home, Interval(*box.whole).middle)
-    )
-    if not np.isfinite(at_home):
+    at = [np.asarray(_matrix(mech, mech.home(), v)) for v in (box.home, Interval(*box.whole).middle)]
+    if not np.all(np.isfinite(at)):
         raise ValueError(f"no certificate for {type(mech).__name__}: A depends on joints that are not free")
+    at_home, at_centre = np.linalg.det(at)
     settle = partial(_regular, box, scale or abs(at_home), tuple(within), at_least, np.sign(at_centre))
     return _bisected(box, settle, [box.whole], most, report, "no singularity")
 

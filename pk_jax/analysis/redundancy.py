@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -107,23 +108,39 @@ def _joints(mech: Mechanism, pose: Any, free: jax.Array, branch: Any) -> jax.Arr
     return inverse_kinematics(mech, pose, branch, free=free[None]).joints
 
 
-def best_free(mech: Mechanism, pose: Any, objectives: Any) -> jax.Array:
+def best_free(mech: Mechanism, pose: Any, objectives: Callable) -> jax.Array:
     """The value within `free_range()` whose least objective is greatest. -> ()"""
-    lower, upper = mech.free_range()[0]
-    least = lambda free: jnp.min(objectives(mech, pose, free))
-    nodes = jnp.linspace(lower, upper, NODES)
-    best = jnp.argmax(jnp.nan_to_num(jax.vmap(least)(nodes), nan=-jnp.inf))
-    slope = jax.grad(least)
+
+    def evaluate(free):
+        return jax.value_and_grad(lambda free: jnp.min(objectives(mech, pose, free)))(free)
+
+    return greatest(evaluate, *mech.free_range()[0])
+
+
+def greatest(evaluate: Callable, lower: jax.Array, upper: jax.Array) -> jax.Array:
+    """Where a function of one variable is greatest, a number or one a lane.
+
+    evaluate: -> value, slope. By a first search on `NODES` values and bisection on the sign of the slope.
+    """
+    step = (upper - lower) / (NODES - 1)
+
+    def look(k, state):
+        best, place = state
+        value = evaluate(lower + k * step)[0]
+        is_better = value > best  # NaN compares False
+        return jnp.where(is_better, value, best), jnp.where(is_better, k, place)
+
+    start = jnp.full_like(lower, -jnp.inf), jnp.zeros(jnp.shape(lower), jnp.int32)
+    place = lax.fori_loop(0, NODES, look, start)[1]
 
     def halve(_, ends):
         middle = (ends[0] + ends[1]) / 2
-        is_rising = slope(middle) > 0
+        is_rising = evaluate(middle)[1] > 0
         return jnp.where(is_rising, middle, ends[0]), jnp.where(is_rising, ends[1], middle)
 
-    ends = nodes[jnp.maximum(best - 1, 0)], nodes[jnp.minimum(best + 1, NODES - 1)]
+    ends = jnp.maximum(lower + (place - 1) * step, lower), jnp.minimum(lower + (place + 1) * step, upper)
     low, high = lax.fori_loop(0, HALVINGS, halve, ends)
-    at = jnp.where(low == lower, lower, jnp.where(high == upper, upper, (low + high) / 2))
-    return at
+    return jnp.where(low == lower, lower, jnp.where(high == upper, upper, (low + high) / 2))
 
 
 def _balance(mech: Mechanism, pose: Any, objectives: Any, place: jax.Array, free: jax.Array) -> jax.Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pk_jax import checks
-from pk_jax.analysis.redundancy import best_free, margins_of
+from pk_jax.analysis.redundancy import greatest, margins_of
 from pk_jax.analysis.slices import Slice, coordinate_names, pose_on, slice_of
 from pk_jax.geometry.axis_pose import AxisPose
 from pk_jax.geometry.poses import pose_units
@@ -21,6 +21,7 @@ from pk_jax.kinematics.batching import home_shapes, rows_of
 from pk_jax.kinematics.entrywise import entrywise
 from pk_jax.kinematics.inverse import branch_rows, free_rows
 from pk_jax.kinematics.lane_map import lane_map
+from pk_jax.kinematics.lanes import Entries
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 
 NODES = {2: 201, 3: 41}
@@ -218,21 +219,37 @@ class _Limits:
 def _on_lanes(axes: tuple[int, ...], is_any: bool) -> Callable:
     """What `lane_map` runs: smallest margin and its number, of coordinates and a pose that has the others."""
 
+    def free_range(mech):
+        return mech.free_range()[0]
+
     def pose_of(at, values):
         return pose_on(at, axes, values)
-
-    def free_of(mech, pose, branch):
-        return best_free(mech, pose, partial(margins_of, branch=branch))[None]
 
     def all_margins(mech, pose, branch, free):
         joints = mech.inverse(pose, branch, free=free)
         return jnp.concatenate([jnp.ravel(margin) for margin in mech.margins(pose, joints).values()])
 
+    def with_slopes(mech, pose, branch, free):
+        of = lambda free: margins_of(mech, pose, free, branch=branch)
+        return jax.jvp(of, (free,), (jnp.ones_like(free),))
+
+    def best_value(mech, pose, branch, like):
+        def evaluate(free):
+            found = entrywise(with_slopes, mech, pose, branch, Entries((), [free]))
+            least = functools.reduce(jnp.minimum, found[0].items)
+            slope = jnp.zeros_like(least)
+            for margin, rate in zip(*(each.items for each in found), strict=True):
+                slope = jnp.where(margin == least, rate, slope)
+            return least, slope
+
+        lower, upper = (end + jnp.zeros_like(like) for end in entrywise(free_range, mech).items)
+        return greatest(evaluate, lower, upper)
+
     def smallest(given, values, at=None):
         mech, held, branch, free = given
         pose = entrywise(pose_of, held if at is None else at, values)
         if is_any:
-            free = entrywise(free_of, mech, pose, branch)
+            free = Entries((1,), [best_value(mech, pose, branch, values.items[0])])
         margins = entrywise(all_margins, mech, pose, branch, free).items
         least = functools.reduce(jnp.minimum, margins)  # NaN stays NaN
         which = jnp.zeros_like(least)

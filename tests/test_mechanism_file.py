@@ -238,7 +238,8 @@ WRONG = {
     ),
     "no family": (
         REST,
-        'missing key \'family\', one of "Stewart", "CasingOscillator", "PlanarRRR", "PlanarRPR", "SixLink", "FiveBar", "TwoRPR"$',
+        "missing key 'family', one of "
+        '"Stewart", "CasingOscillator", "PlanarRRR", "PlanarRPR", "SixLink", "FiveBar", "TwoRPR"$',
     ),
     "empty": ("", "missing key 'family'"),
     "no unit": (

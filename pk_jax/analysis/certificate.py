@@ -94,7 +94,9 @@ def certify_regular(
     if not np.all(np.isfinite(at)):
         raise ValueError(f"no certificate for {type(mech).__name__}: A depends on joints that are not free")
     at_home, at_centre = np.linalg.det(at)
-    settle = partial(_regular, box, scale or abs(at_home), tuple(within), at_least, np.sign(at_centre))
+    scale = abs(at_home) if scale is None else scale
+    within = _margins_named(mech, within) if len(within) else ()
+    settle = partial(_regular, box, scale, within, at_least, np.sign(at_centre))
     return _bisected(box, settle, [box.whole], most, report, "no singularity")
 
 
@@ -119,8 +121,8 @@ def certify_confined(
     workspace that home belongs to, connected in poses and free joints, lies inside the box. A part of
     a face is ruled out by one margin, or by a sum of margins with weights >= 0 that is negative all over
     it (as in Farkas' lemma). `bound` is a number that on every face one margin is below the negative of.
-    ValueError where home is not inside, or the angles are not those of one chart: |pitch| <
-    pi/2, |roll|, |yaw|, |phi| < pi.
+    ValueError where home is not inside the box and the margins, or the angles are not those of one chart:
+    |pitch| < pi/2, |roll|, |yaw|, |phi| < pi.
     """
     require_mechanism("certify_confined", mech)
     names = coordinate_names(mech)
@@ -141,7 +143,10 @@ def certify_confined(
             lower, upper = whole_lower.copy(), whole_upper.copy()
             lower[axis] = upper[axis] = end[axis]
             faces.append((lower, upper))
-    settle = partial(_excluded, box, None if within is None else tuple(within), at_least)
+    within = _margins_named(mech, within)
+    if not float(jnp.min(_margins(mech, mech.home(), jnp.asarray(box.home), within))) >= 0:
+        raise ValueError("home must be inside the margins, it is not")
+    settle = partial(_excluded, box, within, at_least)
     return _bisected(box, settle, faces, most, report, "no way out")
 
 
@@ -282,7 +287,7 @@ def _dominant(size: np.ndarray) -> np.ndarray:
 
 
 def _excluded(
-    box: _Box, within: tuple[str, ...] | None, least: float, lower: np.ndarray, upper: np.ndarray
+    box: _Box, within: tuple[str, ...], least: float, lower: np.ndarray, upper: np.ndarray
 ) -> _Settled:
     """A bound of how negative the least margin is, over each box."""
     middle, half = _halved(lower, upper)
@@ -321,10 +326,23 @@ def _weights(values: np.ndarray, slopes: np.ndarray, half: np.ndarray) -> np.nda
     return best
 
 
+def _margins_named(mech: Mechanism, within: Sequence[str] | None) -> tuple[str, ...]:
+    """Names of margins, by default all; ValueError where the mechanism does not have them."""
+    known = tuple(mech.margins(*mech.home()))
+    within = known if within is None else (within,) if isinstance(within, str) else tuple(within)
+    if not within:
+        raise ValueError(f"{type(mech).__name__} has no margins: give it limits (strokes, cones, ...)")
+    if unknown := [name for name in within if name not in known]:
+        raise ValueError(f"within must name some of {', '.join(known) or 'none'}, got {unknown[0]!r}")
+    if not hasattr(mech, "inverse"):
+        raise ValueError(f"margins need the closed form `inverse`, {type(mech).__name__} has none")
+    return within
+
+
 class _Margins:
     """The margins of some names, as a function of coordinates. -> (margins,)"""
 
-    def __init__(self, names: tuple[str, ...] | None) -> None:
+    def __init__(self, names: tuple[str, ...]) -> None:
         self.names = names
 
     def __call__(self, mech: Mechanism, home: Any, values: jax.Array) -> jax.Array:
@@ -339,7 +357,7 @@ def _margins(mech, home, values, names):
     pose = _pose_at(home[0], values)
     free = values[values.shape[0] - mech.free_joints :] if mech.free_joints else None
     found = mech.margins(pose, mech.inverse(pose, free=free))
-    return jnp.concatenate([jnp.ravel(found[name]) for name in (found if names is None else names)])
+    return jnp.concatenate([jnp.ravel(found[name]) for name in names])
 
 
 @partial(jax.jit, static_argnums=3)
@@ -366,7 +384,8 @@ def _bisected(
     while len(lower) and examined < most and not is_lost:
         here = slice(max(len(lower) - AT_A_TIME, 0), len(lower))  # the last ones: depth first, few are kept
         low, high = lower[here], upper[here]
-        found = settle(low, high)
+        with np.errstate(all="ignore"):  # NaN is what is not known
+            found = settle(low, high)
         examined += len(low)
         is_lost = found.is_lost
         bound = min(bound, np.min(found.bound[found.is_done], initial=np.inf))

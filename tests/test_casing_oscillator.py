@@ -371,7 +371,7 @@ def locus(first):
     return pk.singularity_locus(DEFAULT, (first, "yaw"), ranges=ranges, free=LOCKED, nodes=41)
 
 
-@pytest.mark.parametrize("first", ["roll", "pitch"])
+@pytest.mark.parametrize("first", [pytest.param("roll", marks=pytest.mark.soak), "pitch"])
 def test_loci_are_of_type_ii_and_lock_the_carriage(first):
     found = locus(first)
     assert found.axes == (first, "yaw") and found.units == (0, 0)
@@ -387,6 +387,7 @@ def test_loci_are_of_type_ii_and_lock_the_carriage(first):
         np.testing.assert_allclose(curve.joints[:, :4], expected, rtol=0, atol=1e-9)
 
 
+@pytest.mark.soak  # every pair of axes is compiled anew
 def test_the_locus_in_roll_and_yaw_is_the_root_of_the_closed_form():
     """At every point, to 1e-9 degrees; over all yaws, on both sides; at yaw 0 it is +-75.298 degrees."""
 
@@ -538,7 +539,7 @@ def assert_poses(found, s, rotation, to=1e-11):
     np.testing.assert_allclose(found.rotation, rotation, rtol=0, atol=to)
 
 
-@pytest.mark.parametrize("name", IRREGULAR)
+@pytest.mark.parametrize("name", ["default", pytest.param("other", marks=pytest.mark.soak)])
 def test_forward_of_inverse_is_the_identity_for_every_carriage(name):
     s, rotation, _, found = solved(name, 5)
     back = pk.forward_kinematics(IRREGULAR[name], found.joints)
@@ -784,6 +785,7 @@ def by_hand(points, foot):
     )
 
 
+@pytest.mark.soak  # compiles for longer than it checks
 def test_a_sliding_foot_obeys_the_laws():
     assert len(pk.check_mechanism(SLIDING)) >= 17
 
@@ -830,8 +832,8 @@ def test_joints_too_many_are_told_and_so_is_a_range_that_is_none():
     assert said == "Undeclared has 3 joints in 2 closure equations: the last 1 must be its free_joints"
     said = said_by(pk.check_mechanism, OneEnd(apart=1.2))
     assert said == "OneEnd.free_range must have shape (1, 2), got (2,)"
-    with pytest.raises(NotImplementedError, match=r"^Endless has free joints and no free_range\(\)$"):
-        pk.check_mechanism(Endless(apart=1.2))
+    said = said_by(pk.check_mechanism, Endless(apart=1.2))
+    assert said == "Endless has free_joints and must define free_range()"
 
 
 def test_joints_too_few_are_told():
@@ -1040,7 +1042,7 @@ def test_jacobian_of_a_pose(run):
 
 
 def test_singularity_of_a_pose(run):
-    code, out, _ = run("singularity", NAME, "--pose", f"0.48,0,{np.deg2rad(PITCH)!r},0.3", "--json")
+    code, out, _ = run("singularity", NAME, "--pose", f"0.48,0,{np.deg2rad(PITCH):.17g},0.3", "--json")
     found = json.loads(out)
     assert code == 0 and found["kind"] == "TYPE_II" and found["sigma_direct"] < 1e-12
     code, out, _ = run("singularity", NAME, "--pose", "0.48,0.1,0.2,0.3", "--json")

@@ -12,6 +12,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import pk_jax as pk
+from pk_jax.analysis.certificate import _dominant
 
 OSCILLATOR = pk.CasingOscillator()
 STROKES = ("stroke_min", "stroke_max")
@@ -269,7 +270,7 @@ def test_proved_confined_is_confined():
     """Random machines, random boxes: all over the faces some leg is too short or too long, by the bound."""
     rng = np.random.default_rng(8)
     outcomes = []
-    for size in np.linspace(0.3, 0.9, 10):
+    for size in np.linspace(0.2, 0.7, 4):
         mech = random_oscillator(rng)
         ranges = random_box(rng, mech, size)
         del ranges["E"]
@@ -282,6 +283,47 @@ def test_proved_confined_is_confined():
         else:
             assert is_none(found)
     assert True in outcomes and False in outcomes
+
+
+class Opposed(pk.TwoRPR):
+    """On a face of y = 1, 2.5 either margin is positive somewhere, and at x = 0 both are -1/16."""
+
+    def margins(self, pose, joints):
+        both = 0.5 - (pose[1] - 1.75) ** 2
+        return {"left": 9 * pose[0] + both, "right": -9 * pose[0] + both}
+
+
+def test_margins_exclude_together():
+    """In one step, and by no more than they do."""
+    mech = Opposed(half_base=1.0, l_min=1.0, l_max=3.0)
+    found = pk.certify_confined(mech, {"x": (-1, 1), "y": (1, 2.5)})
+    assert found.is_proved and found.boxes == 4 and 0.06 < found.bound <= 1 / 16
+    assert not pk.certify_confined(mech, {"x": (-1, 1), "y": (1, 2.5)}, at_least=0.07, most=50).is_proved
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 6])
+def test_dominant_diagonals_bound_the_determinant(n):
+    """|det(1 + D)| >= (1 - r)^n, r the spectral radius of |D|; equal where D = -r."""
+    rng = np.random.default_rng(n)
+    off = rng.uniform(-1, 1, (300, n, n)) * rng.uniform(0, 1.2 / n, (300, 1, 1))
+    off[:20] = -np.linspace(0, 0.9, 20)[:, None, None] * np.eye(n)
+    bound = _dominant(np.abs(off))
+    assert np.any(bound > 0.1) and np.any(np.isnan(bound))
+    det = np.abs(np.linalg.det(np.eye(n) + off))
+    assert not np.any(bound > det * (1 + 1e-14))
+    np.testing.assert_allclose(bound[:20], det[:20], rtol=1e-6)
+
+
+class Curved(pk.TwoRPR):
+    """Allowed are two strips beside x = 1, where the first margin is least and has no slope."""
+
+    def margins(self, pose, joints):
+        return {"out": (pose[0] - 1) ** 2 - 0.5, "in": 1.5 - (pose[0] - 1) ** 2}
+
+
+def test_slopes_are_those_of_the_whole_box():
+    mech = Curved(half_base=1.0, l_min=1.0, l_max=3.0)
+    assert is_none(pk.certify_confined(mech, {"x": (-1, 3), "y": (1, 2.5)}, most=1000))
 
 
 def test_regular_wherever_the_strokes_allow():
@@ -410,7 +452,7 @@ def test_progress_is_reported():
     said = []
     found = pk.certify_regular(
         OSCILLATOR,
-        {"pitch": (-0.3, 0.3), "s": (0.4, 0.5)},
+        {"pitch": (-0.3, 0.3), "s": (0.45, 0.5)},
         at_least=0.5,
         report=lambda *each: said.append(each),
     )

@@ -306,6 +306,14 @@ def test_waves_hold_the_exact_value_closely(name):
     assert getattr(intervals, name)(0.0) == 1 - WAVES[name]
 
 
+def test_coefficients_of_the_series_hold_the_exact_ones():
+    for n in range(2 * intervals._TERMS + 2):
+        lower, upper = (Fraction(float(end)) for end in _ends(intervals._over_factorial(n)))
+        assert lower <= Fraction(1, math.factorial(n)) <= upper < lower * (1 + Fraction(1, 10**15))
+    lower, upper = (Fraction(float(end)) for end in _ends(intervals._PI))
+    assert lower < PI < upper < lower + Fraction(1, 10**15)
+
+
 @pytest.mark.parametrize("name", WAVES)
 def test_waves_of_wide_intervals_are_their_range(name):
     """The extremes are where (x - shift) / pi is whole; elsewhere the range is that of the ends."""

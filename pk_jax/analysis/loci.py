@@ -100,6 +100,10 @@ def singularity_locus(
     kinds = tuple(kinds) if not isinstance(kinds, str) else (kinds,)
     if not kinds or set(kinds) - {"I", "II"}:
         raise ValueError(f'kinds must be of "I", "II", got {kinds}')
+    if free is not None:
+        free, many = free_rows(mech, free)
+        if many:
+            raise ValueError("free must be one value of each joint, got a batch")
     axes = tuple(axes.split(",")) if isinstance(axes, str) else axes
     kinds = _curves_of(mech, 2 if axes is None else len(axes), kinds)
     where = slice_of(mech, axes, at, ranges)
@@ -108,10 +112,6 @@ def singularity_locus(
     modes = working_modes(mech)
     if branch is not None:
         modes = np.asarray(branch_rows(mech, branch)[0]).reshape(1, -1)
-    if free is not None:
-        free, many = free_rows(mech, free)
-        if many:
-            raise ValueError("free must be one value of each joint, got a batch")
     say = report or (lambda *_: None)
 
     lines, poses = where.grid(nodes)

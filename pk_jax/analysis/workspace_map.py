@@ -71,8 +71,10 @@ def workspace_map(
     limits = _Limits("workspace_map", mech, branch, free)
     where = slice_of(mech, axes, at, ranges)
     d = len(where.axes)
-    counts = np.broadcast_to(NODES[d] if nodes is None else np.asarray(nodes), d)
-    counts = [checks.is_count("nodes", int(n) if n == int(n) else n, least=2, most=100_001) for n in counts]
+    counts = (NODES[d],) * d if nodes is None else nodes if isinstance(nodes, Sequence) else (nodes,) * d
+    if isinstance(counts, str) or len(counts) != d:
+        raise ValueError(f"nodes must be one number, or one for each of the {d} axes, got {nodes!r}")
+    counts = [checks.is_count("nodes", count, least=2, most=100_001) for count in counts]
     lines = [np.linspace(*ends) for ends in zip(where.lower, where.upper, counts, strict=True)]
     values = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, d)
     margin, limit = limits.over(where, values)
@@ -227,7 +229,8 @@ def _on_lanes(axes: tuple[int, ...], is_any: bool) -> Callable:
 
     def all_margins(mech, pose, branch, free):
         joints = mech.inverse(pose, branch, free=free)
-        return jnp.concatenate([jnp.ravel(margin) for margin in mech.margins(pose, joints).values()])
+        margins = [jnp.ravel(margin) for margin in mech.margins(pose, joints).values()]
+        return jnp.concatenate(margins), joints
 
     def with_slopes(mech, pose, branch, free):
         of = lambda free: margins_of(mech, pose, free, branch=branch)
@@ -250,12 +253,13 @@ def _on_lanes(axes: tuple[int, ...], is_any: bool) -> Callable:
         pose = entrywise(pose_of, held if at is None else at, values)
         if is_any:
             free = Entries((1,), [best_value(mech, pose, branch, values.items[0])])
-        margins = entrywise(all_margins, mech, pose, branch, free).items
+        margins, joints = (each.items for each in entrywise(all_margins, mech, pose, branch, free))
         least = functools.reduce(jnp.minimum, margins)  # NaN stays NaN
         which = jnp.zeros_like(least)
         for number, margin in enumerate(margins):
             which = jnp.where(margin == least, number, which)
-        return [least, which]
+        is_reached = functools.reduce(jnp.logical_and, [jnp.isfinite(joint) for joint in joints])
+        return [jnp.where(is_reached, least, jnp.nan), which]
 
     return smallest
 

@@ -94,13 +94,11 @@ def to_angles(r: jax.Array) -> jax.Array:
     cosine = jnp.sqrt(jnp.where(is_upright, 1, flat))
     down = 0 - r[2, 0]  # not -0
     pitch = jnp.where(is_upright, jnp.sign(down) * jnp.pi / 2, jnp.arctan2(down, cosine))
-    one = jnp.ones_like(flat)
-    roll = jnp.where(is_upright, 0, jnp.arctan2(r[2, 1], jnp.where(is_upright, one, r[2, 2])))
-    yaw = jnp.where(
-        is_upright,
-        jnp.arctan2(-r[0, 1], r[1, 1]),
-        jnp.arctan2(r[1, 0], jnp.where(is_upright, one, r[0, 0])),
-    )
+    one, zero = jnp.ones_like(flat), jnp.zeros_like(flat)
+    pick = lambda upright, other: jnp.where(is_upright, upright, other)
+    roll = pick(zero, jnp.arctan2(r[2, 1], pick(one, r[2, 2])))
+    turn = jnp.arctan2(pick(-r[0, 1], zero), pick(r[1, 1], one))  # what is not taken is kept off (0, 0)
+    yaw = pick(turn, jnp.arctan2(r[1, 0], pick(one, r[0, 0])))
     return jnp.stack([roll, pitch, yaw])
 
 

@@ -80,6 +80,11 @@ def _check_contract(mech: Mechanism, name: str) -> None:
         raise ValueError(
             f"{name} has {m} joints in {c} closure equations: the last {m - c} must be its free_joints"
         )
+    if mech.free_joints and m - mech.free_joints < c:
+        raise ValueError(
+            f"{name} has free_joints = {mech.free_joints}, but its {c} closure equations bind "
+            f"{min(m, c)} of the {m} joints"
+        )
     if mech.free_joints and (shape := mech.free_range().shape) != (mech.free_joints, 2):
         raise ValueError(f"{name}.free_range must have shape {(mech.free_joints, 2)}, got {shape}")
     f, a = jax.eval_shape(mech.linearize, pose, joints)  # shapes alone: op by op it would be slow

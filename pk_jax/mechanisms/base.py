@@ -123,7 +123,7 @@ class Mechanism(abc.ABC):
 
     def free_range(self) -> jax.Array:
         """Least and greatest value of each of the free joints, of mechanisms that have some. -> (k, 2)"""
-        raise NotImplementedError(f"{type(self).__name__} has free joints and no free_range()")
+        raise ValueError(f"{type(self).__name__} has free_joints and must define free_range()")
 
     @abc.abstractmethod
     def skeleton(self, pose: Any, joints: jax.Array) -> Skeleton:

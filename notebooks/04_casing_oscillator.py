@@ -114,11 +114,11 @@ for degrees in (0, 5, 15):
 
 # %%
 for name in ("roll", "pitch", "yaw"):
-    fixed, anywhere = pk.travel(machine, name), pk.travel(machine, name, free="any")
-    print(
-        f"{name:5} {fixed.lower / DEG:8.3f} .. {fixed.upper / DEG:7.3f} deg ({fixed.limit_upper}), "
-        f"with the carriage anywhere {anywhere.lower / DEG:8.3f} .. {anywhere.upper / DEG:7.3f} deg"
-    )
+    ends = pk.travel(machine, name)
+    limits = f"({ends.limit_lower}, {ends.limit_upper})"
+    print(f"{name:5} {ends.lower / DEG:8.3f} .. {ends.upper / DEG:7.3f} deg", limits)
+ends = pk.travel(machine, "pitch", free="any")
+print(f"pitch {ends.lower / DEG:8.3f} .. {ends.upper / DEG:7.3f} deg with the carriage anywhere")
 
 # %%
 wide = [(-20 * DEG, 20 * DEG)] * 2
@@ -134,14 +134,13 @@ figure
 # %% [markdown]
 # ## Where to put the carriage
 #
-# `resolve_redundancy` puts the carriage where the smallest margin is greatest, or where the platform is
-# held best, by gradients; the result is differentiable in the pose and in the geometry.
+# `resolve_redundancy` puts the carriage where the smallest margin is greatest, or (`by="conditioning"`) where
+# the platform is held best, by gradients; the result is differentiable in the pose and in the geometry.
 
 # %%
 steep = pk.AxisPose.from_angles(0.48, pitch=9 * DEG)
-for by in ("margin", "conditioning"):
-    found = pk.resolve_redundancy(machine, steep, by=by)
-    print(f"{by:13} E = {1e3 * float(found.free[0]):.3f} mm, value {float(found.value):.4f}")
+found = pk.resolve_redundancy(machine, steep)
+print(f"E = {1e3 * float(found.free[0]):.3f} mm, smallest margin {float(found.value):.4f}")
 
 
 def best_carriage(pitch):
@@ -149,7 +148,7 @@ def best_carriage(pitch):
 
 
 x, h = 9 * DEG, 1e-5
-slope, difference = jax.grad(best_carriage)(x), (best_carriage(x + h) - best_carriage(x - h)) / (2 * h)
+slope, difference = jax.jacfwd(best_carriage)(x), (best_carriage(x + h) - best_carriage(x - h)) / (2 * h)
 print(f"dE/dpitch {float(slope):.9f}, by differences {float(difference):.9f} m/rad")
 assert abs(slope - difference) < 1e-8
 
@@ -173,7 +172,7 @@ for case in paper.singular_cases(machine):
 # %%
 from pk_jax.viz.singularity import draw_locus
 
-locus = pk.singularity_locus(machine, "pitch,yaw", nodes=61)
+locus = pk.singularity_locus(machine, "pitch,yaw", ranges=[(-0.5, 1.8), (-1.2, 1.2)], nodes=41)
 lines = sorted(
     {
         round(float(c.coordinates[:, 0].mean()) / DEG, 9)

@@ -137,7 +137,7 @@ def singular_pitch():
 @pytest.mark.parametrize(("below", "above"), [(0.3, 0.2), (0.1, 0.0), (0.0, 0.1)])
 def test_a_box_that_reaches_a_singularity_is_not_proved(below, above):
     pitch = singular_pitch()
-    found = pk.certify_regular(OSCILLATOR, {"pitch": (pitch - below, pitch + above)}, at_least=1e-9, most=300)
+    found = pk.certify_regular(OSCILLATOR, {"pitch": (pitch - below, pitch + above)}, at_least=1e-9, most=100)
     assert is_none(found)
     lower, upper = found.unsettled
     assert np.any((lower[:, 2] <= pitch) & (pitch <= upper[:, 2]))
@@ -254,7 +254,7 @@ def test_proved_regular_is_regular(at_least):
     """Random machines, random boxes: one sign of det A, and never less of it than the bound."""
     rng = np.random.default_rng(7)
     outcomes = []
-    for size in np.linspace(0.05, 0.7, 7):
+    for size in np.linspace(0.05, 0.7, 4):
         mech = random_oscillator(rng)
         found = pk.certify_regular(mech, random_box(rng, mech, size), at_least=at_least, most=60)
         outcomes.append(found.is_proved)
@@ -270,7 +270,7 @@ def test_proved_confined_is_confined():
     """Random machines, random boxes: all over the faces some leg is too short or too long, by the bound."""
     rng = np.random.default_rng(8)
     outcomes = []
-    for size in np.linspace(0.2, 0.7, 4):
+    for size in np.linspace(0.2, 0.7, 3):
         mech = random_oscillator(rng)
         ranges = random_box(rng, mech, size)
         del ranges["E"]
@@ -305,7 +305,7 @@ def test_margins_exclude_together():
 def test_dominant_diagonals_bound_the_determinant(n):
     """|det(1 + D)| >= (1 - r)^n, r the spectral radius of |D|; equal where D = -r."""
     rng = np.random.default_rng(n)
-    off = rng.uniform(-1, 1, (300, n, n)) * rng.uniform(0, 1.2 / n, (300, 1, 1))
+    off = rng.uniform(-1, 1, (300, n, n)) * rng.uniform(0, 3 / n, (300, 1, 1))
     off[:20] = -np.linspace(0, 0.9, 20)[:, None, None] * np.eye(n)
     bound = _dominant(np.abs(off))
     assert np.any(bound > 0.1) and np.any(np.isnan(bound))

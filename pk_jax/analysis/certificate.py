@@ -85,12 +85,13 @@ def certify_regular(
     singularity, or `most` was too small. ValueError for mechanisms that `enclosure` has no
     rules for, or whose A depends on joints that are not free.
     """
-    box = _Box("certify_regular", mech, ranges)
+    _check("certify_regular", mech, at_least)
+    box = _Box(mech, ranges)
     if box.equations != box.n:
         raise ValueError(
             f"certify_regular needs as many equations as coordinates, {type(mech).__name__} has others"
         )
-    at = [np.asarray(_matrix(mech, mech.home(), v)) for v in (box.home, Interval(*box.whole).middle)]
+    at = [np.asarray(_matrix(mech, box.at_home(), v)) for v in (box.home, Interval(*box.whole).middle)]
     if not np.all(np.isfinite(at)):
         raise ValueError(f"no certificate for {type(mech).__name__}: A depends on joints that are not free")
     at_home, at_centre = np.linalg.det(at)
@@ -124,14 +125,14 @@ def certify_confined(
     ValueError where home is not inside the box and the margins, or the angles are not those of one chart:
     |pitch| < pi/2, |roll|, |yaw|, |phi| < pi.
     """
-    require_mechanism("certify_confined", mech)
+    _check("certify_confined", mech, at_least)
     names = coordinate_names(mech)
     if missing := [name for name in names if name not in ranges]:
         raise ValueError(f"ranges must have every coordinate of the pose, {', '.join(missing)} missing")
     free = (
         dict(zip(_free_names(mech), np.asarray(mech.free_range()), strict=True)) if mech.free_joints else {}
     )
-    box = _Box("certify_confined", mech, {**ranges, **free})
+    box = _Box(mech, {**ranges, **free})
     _check_chart(box)
     whole_lower, whole_upper = box.whole
     at_home = box.home[: len(names)]
@@ -150,16 +151,21 @@ def certify_confined(
     return _bisected(box, settle, faces, most, report, "no way out")
 
 
+def _check(function: str, mech: Any, at_least: Any) -> None:
+    require_mechanism(function, mech)
+    if not checks.is_concrete(mech) or mech.length().dtype != jnp.float64:
+        raise ValueError("a certificate needs known values in float64: call pk_jax.enable_x64() first")
+    if not (np.ndim(at_least) == 0 and np.isfinite(at_least) and at_least >= 0):
+        raise ValueError(f"at_least must be a finite number >= 0, got {at_least}")
+
+
 # --- boxes of coordinates
 
 
 class _Box:
     """The box that a user names, and functions of its coordinates (pose, then free joints)."""
 
-    def __init__(self, function: str, mech: Mechanism, ranges: Mapping[str, Sequence[float]]) -> None:
-        require_mechanism(function, mech)
-        if not checks.is_concrete(mech) or mech.length().dtype != jnp.float64:
-            raise ValueError("a certificate needs known values in float64: call pk_jax.enable_x64() first")
+    def __init__(self, mech: Mechanism, ranges: Mapping[str, Sequence[float]]) -> None:
         self.mech = mech
         pose, joints = mech.home()
         self.names = (*coordinate_names(mech), *_free_names(mech))
@@ -174,15 +180,27 @@ class _Box:
                 raise ValueError(f"ranges must name some of {', '.join(self.names)}, got {name!r}")
             ends = checks.real_numpy(f"ranges[{name!r}]", given).astype(float)
             if ends.shape != (2,) or not np.all(np.isfinite(ends)) or not ends[0] <= ends[1]:
-                raise ValueError(f"ranges[{name!r}] must be (lower, upper), lower <= upper, got {given}")
+                got = " ".join(str(given).split())
+                raise ValueError(f"ranges[{name!r}] must be (lower, upper), lower <= upper, got {got}")
             place = self.names.index(name)
             lower[place], upper[place] = ends
         self.whole = lower, upper
 
-    def enclosed(self, function: Callable, lower: np.ndarray, upper: np.ndarray) -> Any:
+    def at_home(self, boxes: int | None = None) -> tuple[Any, Any]:
+        """The home pose, and joints of which nothing is known, so that none can have a say unnoticed."""
+        pose, joints = self.mech.home()
+        if boxes is None:
+            return pose, jnp.full_like(joints, jnp.nan)
+        nothing = np.full((boxes, len(joints)), np.nan)
+        return pose, Interval(nothing, nothing)
+
+    def enclosed(
+        self, function: Callable, lower: np.ndarray, upper: np.ndarray, *, is_slope: bool = False
+    ) -> Any:
         """Bounds of `function(mech, home, coordinates)` over boxes (k, d)."""
+        box = Interval(lower, upper)
         try:
-            return enclosure(function, self.mech, self.mech.home(), Interval(lower, upper))
+            return enclosure(function, self.mech, self.at_home(len(lower)), box, is_slope=is_slope)
         except UnknownPrimitive as error:
             what = f"{type(self.mech).__name__}: there are no bounds of the primitive {error}"
             raise ValueError(f"no certificate for {what}") from None
@@ -216,11 +234,10 @@ def _pose_at(home: Any, values: jax.Array) -> Any:
 
 @jax.jit
 def _matrix(mech: Mechanism, home: Any, values: jax.Array) -> jax.Array:
-    """A at coordinates; joints that are not free are NaN, so that none can have a say. -> (n, n)"""
+    """A at coordinates, of which the last are the free joints; the others are those of `home`. -> (n, n)"""
     pose, joints = home
-    bound = joints.shape[0] - mech.free_joints
-    unknown = jnp.full(bound, jnp.nan, joints.dtype)
-    joints = jnp.concatenate([unknown, values[values.shape[0] - mech.free_joints :]])
+    count = mech.free_joints
+    joints = jnp.concatenate([joints[: joints.shape[0] - count], values[values.shape[0] - count :]])
     return mech.linearize(_pose_at(pose, values), joints)[1]
 
 
@@ -250,7 +267,7 @@ def _regular(
     """|det A| / scale bounded from below, over each box."""
     middle, half = _halved(lower, upper)
     at_middle = box.enclosed(_matrix, middle, middle)
-    slopes = box.enclosed(_matrix_slopes, lower, upper)
+    slopes = box.enclosed(_matrix_slopes, lower, upper, is_slope=True)
     near = at_middle.middle
     signs = np.sign(np.linalg.det(near))
     inverse = thin(np.linalg.inv(np.where((signs != 0)[:, None, None], near, np.eye(box.n))))
@@ -293,7 +310,7 @@ def _excluded(
     middle, half = _halved(lower, upper)
     function = _Margins(within)
     natural, at_middle = (box.enclosed(function, *ends) for ends in ((lower, upper), (middle, middle)))
-    slopes = box.enclosed(function.slopes, lower, upper)  # (k, margins, d)
+    slopes = box.enclosed(function.slopes, lower, upper, is_slope=True)  # (k, margins, d)
     weights = _weights(at_middle.middle, slopes.middle, half)
     of_slopes = total(times(thin(weights[:, :, None]), slopes), axis=1)
     changes = times(absolute(of_slopes), thin(half)).upper
@@ -382,7 +399,8 @@ def _bisected(
     lower, upper = (np.stack(ends) for ends in zip(*starts, strict=True))
     bound, examined, is_lost = np.inf, 0, False
     while len(lower) and examined < most and not is_lost:
-        here = slice(max(len(lower) - AT_A_TIME, 0), len(lower))  # the last ones: depth first, few are kept
+        count = min(AT_A_TIME, most - examined, len(lower))
+        here = slice(len(lower) - count, len(lower))  # the last ones: depth first, few are kept
         low, high = lower[here], upper[here]
         with np.errstate(all="ignore"):  # NaN is what is not known
             found = settle(low, high)
@@ -394,6 +412,9 @@ def _bisected(
         spread = np.where(np.isnan(spread), np.inf, spread)
         rows, axis = np.arange(len(open_low)), np.argmax(spread, axis=1)
         cut = _halved(open_low, open_high)[0][rows, axis]
+        is_lost |= not np.all(
+            (open_low[rows, axis] < cut) & (cut < open_high[rows, axis])
+        )  # nothing to bisect
         below, above = open_high.copy(), open_low.copy()
         below[rows, axis] = above[rows, axis] = cut
         lower = np.concatenate([lower[: here.start], open_low, above])

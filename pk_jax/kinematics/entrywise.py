@@ -247,8 +247,8 @@ _REDUCTIONS: dict[str, Callable[[Rules], Callable]] = {
     "reduce_prod": lambda rules: rules.times,
     "reduce_max": lambda rules: rules.greater,
     "reduce_min": lambda rules: rules.lesser,
-    "reduce_and": lambda rules: lambda a, b: jnp.logical_and(a, b),
-    "reduce_or": lambda rules: lambda a, b: jnp.logical_or(a, b),
+    "reduce_and": lambda rules: rules.lesser,
+    "reduce_or": lambda rules: rules.greater,
 }
 
 

@@ -47,19 +47,22 @@ class Interval:
 Item = Any  # an Interval, or a known float: exactly that number
 
 
-def enclosure(function: Callable, *arguments: Any) -> Any:
+def enclosure(function: Callable, *arguments: Any, is_slope: bool = False) -> Any:
     """Bounds of `function(*arguments)`, code of one configuration, over boxes.
 
     The leaves of the arguments are `Interval`s of arrays (boxes, *shape), or arrays known exactly; those of
-    the answer are `Interval`s (boxes, *shape). ValueError for code with primitives that have no
-    rule here (comparisons, loops, factorizations).
+    the answer are `Interval`s (boxes, *shape). UnknownPrimitive for code with primitives that have no
+    rule here (loops, factorizations, `stop_gradient`, whose slope is none).
+
+    is_slope: the function is a derivative. Where a choice (`jnp.where`) is not known over a box the
+    function that it belongs to may jump, which no slope tells: NaN then, instead of both values.
     """
     split = lambda leaf: _split(leaf) if isinstance(leaf, Interval) else _exactly(leaf)
     is_leaf = lambda leaf: isinstance(leaf, Interval)
     entries = jax.tree.map(split, arguments, is_leaf=is_leaf)
     boxes = next(len(leaf.lower) for leaf in jax.tree.leaves(arguments, is_leaf=is_leaf) if is_leaf(leaf))
     with np.errstate(all="ignore"):
-        found = entrywise(function, *entries, rules=RULES)
+        found = entrywise(function, *entries, rules=SLOPES if is_slope else RULES)
     return jax.tree.map(lambda each: _joined(each, boxes), found, is_leaf=is_entries)
 
 
@@ -225,7 +228,7 @@ def _wave(a: Item, shift: float) -> Interval:
     """cos(a - shift pi): the hull of both ends, and +-1 where an extreme may lie between them."""
     a = as_interval(a)
     series = _sine_of if shift else _cosine_of
-    ends = [series(Interval(end, end)) for end in (a.lower, a.upper)]
+    ends = [as_interval(series(Interval(end, end))) for end in (a.lower, a.upper)]
     least = np.minimum(ends[0].lower, ends[1].lower)
     greatest = np.maximum(ends[0].upper, ends[1].upper)
     turns = minus(over(a, _PI), shift)  # extremes are where this is whole
@@ -319,16 +322,33 @@ def determinant(a: Interval) -> Interval:
 # --- rules for `entrywise`
 
 
-def _elementwise(equation: Any, *items: Item) -> Item:
+def _elementwise(equation: Any, *items: Item, is_slope: bool = False) -> Item:
     if (item := picked(equation, *items)) is not None:
         return item
     name = equation.primitive.name
     is_number = np.issubdtype(equation.outvars[0].aval.dtype, np.floating)
     if not is_number and not any(isinstance(item, Interval) for item in items):
         return of_known(equation, *items)
+    if name == "stop_gradient" and not isinstance(items[0], Interval):
+        return items[0]
+    if (
+        name == "convert_element_type"
+        and np.issubdtype(equation.invars[0].aval.dtype, np.floating)
+        and is_number
+    ):
+        return items[0]
+    if name == "select_n" and is_slope:
+        return _sure(*items)
     if name not in _ELEMENTWISE:
         raise UnknownPrimitive(name)
     return _ELEMENTWISE[name](*items)
+
+
+def _sure(condition: Interval, otherwise: Item, then: Item) -> Interval:
+    """What is chosen; NaN where that is not known."""
+    found = chosen(condition, otherwise, then)
+    unknown = np.where(condition.lower == condition.upper, 0.0, np.nan)
+    return Interval(found.lower + unknown, found.upper + unknown)
 
 
 # --- comparisons: [1, 1] where they hold all over a box, [0, 0] where nowhere, else [0, 1]
@@ -358,7 +378,7 @@ _ELEMENTWISE: dict[str, Callable] = {
     "gt": lambda a, b: _below(b, a, strictly=True),
     "le": lambda a, b: _below(a, b, strictly=False),
     "lt": lambda a, b: _below(a, b, strictly=True),
-    "not": lambda a: plus(1.0, negative(a)),
+    "not": lambda a: Interval(1 - a.upper, 1 - a.lower),  # exact
     "or": greater,
     "select_n": chosen,
     "abs": absolute,
@@ -367,7 +387,6 @@ _ELEMENTWISE: dict[str, Callable] = {
     "min": lesser,
     "sin": sine,
     "sqrt": root,
-    "stop_gradient": lambda a: a,
 }
 
 RULES = Rules(
@@ -383,3 +402,4 @@ RULES = Rules(
     _elementwise,
     can_fall_back=False,
 )
+SLOPES = RULES._replace(elementwise=functools.partial(_elementwise, is_slope=True))

@@ -542,8 +542,6 @@ UNKNOWN = {
     "exp": jnp.exp,
     "sign": jnp.sign,
     "equal": lambda x: jnp.where(x == 0, 1.0, 2.0),
-    "all": lambda x: jnp.where(jnp.all(jnp.stack([x, -x]) > 0), 1.0, 2.0),
-    "any": lambda x: jnp.where(jnp.any(jnp.stack([x, -x]) > 0), 1.0, 2.0),
 }
 
 
@@ -563,3 +561,13 @@ def test_floating_point_warnings_have_no_say():
             found[setting] = enclosure(code, within)
     for end in ("lower", "upper"):
         np.testing.assert_array_equal(*(getattr(each, end) for each in found.values()))
+
+
+def test_choices_by_all_and_by_any():
+    both = lambda x: jnp.stack([x, x - 1])
+    found = enclosure(
+        lambda x: jnp.stack([jnp.where(f(both(x) > 0), 10.0, 20.0) for f in (jnp.all, jnp.any)]),
+        Interval(np.array([1.5, 0.5, -1.0, -2.0]), np.array([2.0, 0.9, 2.0, -1.0])),
+    )
+    np.testing.assert_array_equal(found.lower, [[10, 10], [20, 10], [10, 10], [20, 20]])
+    np.testing.assert_array_equal(found.upper, [[10, 10], [20, 10], [20, 20], [20, 20]])

@@ -194,13 +194,11 @@ class _Box:
         nothing = np.full((boxes, len(joints)), np.nan)
         return pose, Interval(nothing, nothing)
 
-    def enclosed(
-        self, function: Callable, lower: np.ndarray, upper: np.ndarray, *, is_slope: bool = False
-    ) -> Any:
-        """Bounds of `function(mech, home, coordinates)` over boxes (k, d)."""
+    def enclosed(self, function: Callable, lower: np.ndarray, upper: np.ndarray) -> Any:
+        """Bounds of `function(mech, home, coordinates)` over boxes (k, d); NaN where it may jump."""
         box = Interval(lower, upper)
         try:
-            return enclosure(function, self.mech, self.at_home(len(lower)), box, is_slope=is_slope)
+            return enclosure(function, self.mech, self.at_home(len(lower)), box, is_sure=True)
         except UnknownPrimitive as error:
             what = f"{type(self.mech).__name__}: there are no bounds of the primitive {error}"
             raise ValueError(f"no certificate for {what}") from None
@@ -266,12 +264,13 @@ def _regular(
 ) -> _Settled:
     """|det A| / scale bounded from below, over each box."""
     middle, half = _halved(lower, upper)
-    at_middle = box.enclosed(_matrix, middle, middle)
-    slopes = box.enclosed(_matrix_slopes, lower, upper, is_slope=True)
+    natural, at_middle = (box.enclosed(_matrix, *ends) for ends in ((lower, upper), (middle, middle)))
+    slopes = box.enclosed(_matrix_slopes, lower, upper)
     near = at_middle.middle
     signs = np.sign(np.linalg.det(near))
     inverse = thin(np.linalg.inv(np.where((signs != 0)[:, None, None], near, np.eye(box.n))))
     changes = times(absolute(matrix_product(inverse, slopes)), thin(half[:, None, None, :])).upper
+    changes = changes + _unknown(natural)[:, :, :, None]  # slopes do not tell of jumps
     change = total(thin(changes), axis=3).upper
     off = minus(matrix_product(inverse, at_middle), thin(np.eye(box.n)))
     off = plus(off, Interval(-change, change))  # C A - 1
@@ -285,6 +284,11 @@ def _regular(
         bound = np.where(is_done & ~(bound > least), np.inf, bound)
     is_lost = not within and bool(np.any(signs * sign <= 0))  # det A changes its sign in the box
     return _Settled(bound, is_done, changes.sum(axis=(1, 2)), is_lost)
+
+
+def _unknown(natural: Interval) -> np.ndarray:
+    """NaN where bounds are not known, else 0."""
+    return np.where(np.isnan(natural.lower + natural.upper), np.nan, 0.0)
 
 
 def _dominant(size: np.ndarray) -> np.ndarray:
@@ -310,10 +314,11 @@ def _excluded(
     middle, half = _halved(lower, upper)
     function = _Margins(within)
     natural, at_middle = (box.enclosed(function, *ends) for ends in ((lower, upper), (middle, middle)))
-    slopes = box.enclosed(function.slopes, lower, upper, is_slope=True)  # (k, margins, d)
+    slopes = box.enclosed(function.slopes, lower, upper)  # (k, margins, d)
     weights = _weights(at_middle.middle, slopes.middle, half)
     of_slopes = total(times(thin(weights[:, :, None]), slopes), axis=1)
     changes = times(absolute(of_slopes), thin(half)).upper
+    changes = changes + _unknown(natural).sum(axis=1, keepdims=True)  # slopes do not tell of jumps
     value = plus(total(times(thin(weights), at_middle), axis=1), total(thin(changes), axis=1))
     # the weights sum up to 1 but for roundoff, and so does what they weigh
     combined = over(value, total(thin(weights), axis=1)).upper

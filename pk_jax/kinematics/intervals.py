@@ -47,22 +47,22 @@ class Interval:
 Item = Any  # an Interval, or a known float: exactly that number
 
 
-def enclosure(function: Callable, *arguments: Any, is_slope: bool = False) -> Any:
+def enclosure(function: Callable, *arguments: Any, is_sure: bool = False) -> Any:
     """Bounds of `function(*arguments)`, code of one configuration, over boxes.
 
     The leaves of the arguments are `Interval`s of arrays (boxes, *shape), or arrays known exactly; those of
     the answer are `Interval`s (boxes, *shape). UnknownPrimitive for code with primitives that have no
     rule here (loops, factorizations, `stop_gradient`, whose slope is none).
 
-    is_slope: the function is a derivative. Where a choice (`jnp.where`) is not known over a box the
-    function that it belongs to may jump, which no slope tells: NaN then, instead of both values.
+    is_sure: where a choice (`jnp.where`) is not known over a box, NaN instead of both values. The function
+    may jump there, which its derivatives don't tell.
     """
     split = lambda leaf: _split(leaf) if isinstance(leaf, Interval) else _exactly(leaf)
     is_leaf = lambda leaf: isinstance(leaf, Interval)
     entries = jax.tree.map(split, arguments, is_leaf=is_leaf)
     boxes = next(len(leaf.lower) for leaf in jax.tree.leaves(arguments, is_leaf=is_leaf) if is_leaf(leaf))
     with np.errstate(all="ignore"):
-        found = entrywise(function, *entries, rules=SLOPES if is_slope else RULES)
+        found = entrywise(function, *entries, rules=SURE if is_sure else RULES)
     return jax.tree.map(lambda each: _joined(each, boxes), found, is_leaf=is_entries)
 
 
@@ -231,7 +231,7 @@ def _wave(a: Item, shift: float) -> Interval:
     ends = [as_interval(series(Interval(end, end))) for end in (a.lower, a.upper)]
     least = np.minimum(ends[0].lower, ends[1].lower)
     greatest = np.maximum(ends[0].upper, ends[1].upper)
-    turns = minus(over(a, _PI), shift)  # extremes are where this is whole
+    turns = as_interval(minus(over(a, _PI), shift))  # extremes are where this is whole
     first, last = np.ceil(turns.lower), np.floor(turns.upper)
     count = last - first
     is_even = np.mod(first, 2) == 0
@@ -322,7 +322,7 @@ def determinant(a: Interval) -> Interval:
 # --- rules for `entrywise`
 
 
-def _elementwise(equation: Any, *items: Item, is_slope: bool = False) -> Item:
+def _elementwise(equation: Any, *items: Item, is_sure: bool = False) -> Item:
     if (item := picked(equation, *items)) is not None:
         return item
     name = equation.primitive.name
@@ -337,7 +337,7 @@ def _elementwise(equation: Any, *items: Item, is_slope: bool = False) -> Item:
         and is_number
     ):
         return items[0]
-    if name == "select_n" and is_slope:
+    if name == "select_n" and is_sure:
         return _sure(*items)
     if name not in _ELEMENTWISE:
         raise UnknownPrimitive(name)
@@ -402,4 +402,4 @@ RULES = Rules(
     _elementwise,
     can_fall_back=False,
 )
-SLOPES = RULES._replace(elementwise=functools.partial(_elementwise, is_slope=True))
+SURE = RULES._replace(elementwise=functools.partial(_elementwise, is_sure=True))

@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from pk_jax import checks
-from pk_jax.analysis.slices import coordinate_names
+from pk_jax.analysis.slices import coordinate_names, coordinates_of
 from pk_jax.geometry import rotations
 from pk_jax.geometry.axis_pose import AxisPose
-from pk_jax.geometry.poses import position, retract, tangent_zero
+from pk_jax.geometry.poses import retract, tangent_size
 from pk_jax.geometry.se3 import SE3
 from pk_jax.kinematics.batching import home_shapes
 from pk_jax.kinematics.entrywise import UnknownPrimitive
@@ -169,10 +169,9 @@ class _Box:
         self.mech = mech
         pose, joints = mech.home()
         self.names = (*coordinate_names(mech), *_free_names(mech))
-        self.n = tangent_zero(pose).shape[0]
+        self.n = tangent_size(pose)
         self.equations = jax.eval_shape(mech.residual, pose, joints).shape[0]
-        turn = rotations.to_angles(pose.rotation) if isinstance(pose, AxisPose) else np.zeros(3)
-        at = np.append(np.asarray(position(pose)), np.asarray(turn))[: self.n]
+        at = coordinates_of(jax.tree.map(lambda leaf: leaf[None], pose))[0]
         self.home = np.append(at, np.asarray(joints)[len(joints) - mech.free_joints :])
         lower, upper = self.home.copy(), self.home.copy()
         for name, given in ranges.items():

@@ -77,6 +77,15 @@ def pose_on(at: Any, axes: tuple[int, ...], values: jax.Array) -> Any:
     return like(at, all_six[:3], turn @ at.rotation)
 
 
+def coordinates_of(poses: Any) -> np.ndarray:
+    """Coordinates of a batch of poses; turns of an `SE3` are zero, being counted from it. -> (batch, n)"""
+    if isinstance(poses, AxisPose):
+        return np.column_stack([poses.s, poses.angles()])
+    if isinstance(poses, SE3):
+        return np.column_stack([poses.translation, np.zeros((len(poses.translation), 3))])
+    return np.asarray(poses)
+
+
 @partial(jax.jit, static_argnums=1)
 def poses_on(at: Any, axes: tuple[int, ...], values: jax.Array) -> Any:
     """`pose_on` of many values (batch, d)."""

@@ -13,10 +13,8 @@ import numpy as np
 
 from pk_jax import checks
 from pk_jax.analysis.redundancy import greatest, margins_of
-from pk_jax.analysis.slices import Slice, coordinate_names, pose_on, slice_of
-from pk_jax.geometry.axis_pose import AxisPose
+from pk_jax.analysis.slices import Slice, coordinate_names, coordinates_of, pose_on, slice_of
 from pk_jax.geometry.poses import pose_units
-from pk_jax.geometry.se3 import SE3
 from pk_jax.kinematics.batching import home_shapes, rows_of
 from pk_jax.kinematics.entrywise import entrywise
 from pk_jax.kinematics.inverse import branch_rows, free_rows
@@ -131,44 +129,36 @@ def travel(
     steps = checks.is_count("steps", steps, most=100_000)
     at, many = rows_of("at", mech.home()[0] if at is None else at, pose)
     starts = jax.tree.map(lambda leaf: leaf if many else leaf[None], at)
-    begin = _coordinate(starts, axis)
-    ends, which = [], []
-    for way in (-1.0, 1.0):
-        inside = lambda values: limits.along(starts, axis, values)
-        margin, _ = inside(begin)
-        is_started = margin >= 0
-        low, high = np.zeros_like(begin), np.full_like(begin, np.nan)
-        for step in np.linspace(0, most, steps + 1)[1:]:  # the first step outside
-            open_rows = np.isnan(high) & is_started
-            if not open_rows.any():
-                break
-            out = ~(inside(begin + way * step)[0] >= 0)
-            high = np.where(open_rows & out, step, high)
-            low = np.where(open_rows & ~out, step, low)
-        is_ended = ~np.isnan(high)
-        high = np.where(is_ended, high, most)
-        for _ in range(60):
-            middle = (low + high) / 2
-            is_in = inside(begin + way * middle)[0] >= 0
-            low, high = np.where(is_in, middle, low), np.where(is_in, high, middle)
-        low = np.where(is_ended, low, most)
-        _, limit = inside(begin + way * high)
-        ends.append(np.where(is_started, begin + way * low, np.nan))
-        which.append([limits.names[k] if e and k >= 0 else "" for k, e in zip(limit, is_ended, strict=True)])
-    if many:
-        return Travel(*ends, *map(tuple, which))
-    return Travel(*(each[0] for each in ends), *(each[0] for each in which))
+    begin = coordinates_of(starts)[:, axis].astype(float)
+    look = lambda values: limits.along(starts, axis, values)
+    ends = [_end(look, begin, way, most, steps) for way in (-1.0, 1.0)]
+    found = [end for end, _ in ends] + [
+        tuple(limits.names[k] if k >= 0 else "" for k in which) for _, which in ends
+    ]
+    return Travel(*found) if many else Travel(*(each[0] for each in found))
 
 
-def _coordinate(poses: Any, axis: int) -> np.ndarray:
-    """One coordinate of a batch of poses; turns of an `SE3` are counted from it."""
-    if isinstance(poses, AxisPose):
-        every = np.column_stack([poses.s, poses.angles()])
-    elif isinstance(poses, SE3):
-        every = np.column_stack([poses.translation, np.zeros((len(poses.translation), 3))])
-    else:
-        every = np.asarray(poses)
-    return every[:, axis].astype(float)
+def _end(
+    look: Callable, begin: np.ndarray, way: float, most: float, steps: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where each row leaves its limits, NaN where it starts outside; and by which, -1 where it does not."""
+    is_inside = lambda distance: look(begin + way * distance)[0] >= 0  # NaN compares False
+    is_started = is_inside(np.zeros_like(begin))
+    low, high = np.zeros_like(begin), np.full_like(begin, np.nan)
+    for distance in np.linspace(0, most, steps + 1)[1:]:  # the first step outside
+        is_open = np.isnan(high) & is_started
+        if not is_open.any():
+            break
+        is_in = is_inside(np.full_like(begin, distance))
+        low, high = np.where(is_open & is_in, distance, low), np.where(is_open & ~is_in, distance, high)
+    is_ended = ~np.isnan(high)
+    high = np.where(is_ended, high, most)
+    for _ in range(60):
+        middle = (low + high) / 2
+        is_in = is_inside(middle)
+        low, high = np.where(is_in, middle, low), np.where(is_in, high, middle)
+    end = np.where(is_started, begin + way * np.where(is_ended, low, most), np.nan)
+    return end, np.where(is_ended, look(begin + way * high)[1], -1)
 
 
 # --- the smallest margin of many poses

@@ -8,7 +8,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pk_jax.analysis.certificate import Certificate as Certificate
+    from pk_jax.analysis.boxes import Certificate as Certificate
     from pk_jax.analysis.certificate import certify_confined as certify_confined
     from pk_jax.analysis.certificate import certify_regular as certify_regular
     from pk_jax.analysis.indices import LocalIndices as LocalIndices
@@ -76,8 +76,8 @@ if TYPE_CHECKING:
     from pk_jax.viz.skeleton import draw as draw
 
 _NAMES = {
+    "pk_jax.analysis.boxes": ("Certificate",),
     "pk_jax.analysis.certificate": (
-        "Certificate",
         "certify_confined",
         "certify_regular",
     ),

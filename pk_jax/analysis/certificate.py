@@ -9,25 +9,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from pk_jax import checks
-from pk_jax.analysis.slices import coordinate_names, coordinates_of
-from pk_jax.geometry import rotations
-from pk_jax.geometry.axis_pose import AxisPose
-from pk_jax.geometry.poses import retract, tangent_size
-from pk_jax.geometry.se3 import SE3
-from pk_jax.kinematics.batching import home_shapes
-from pk_jax.kinematics.entrywise import UnknownPrimitive
+from pk_jax.analysis.boxes import (
+    MOST,
+    Box,
+    Certificate,
+    Report,
+    Settled,
+    bisected,
+    check_chart,
+    free_names,
+    halved,
+    pose_at,
+)
+from pk_jax.analysis.slices import coordinate_names
 from pk_jax.kinematics.intervals import (
     Interval,
     absolute,
     determinant,
-    enclosure,
     matrix_product,
     minus,
     over,
@@ -38,23 +43,6 @@ from pk_jax.kinematics.intervals import (
     total,
 )
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
-
-MOST = 1_000_000  # boxes
-AT_A_TIME = 2048
-
-Report = Callable[..., None]
-
-
-class Certificate(NamedTuple):
-    """What was proved. Names and order of the coordinates are in `names`."""
-
-    is_proved: bool
-    bound: float  # what the proof leaves to spare, see the function; NaN where it is none
-    boxes: int  # examined
-    names: tuple[str, ...]
-    lower: np.ndarray  # (d,) of the whole box
-    upper: np.ndarray
-    unsettled: tuple[np.ndarray, np.ndarray]  # lower and upper (k, d) of boxes that are left
 
 
 def certify_regular(
@@ -86,7 +74,7 @@ def certify_regular(
     rules for, or whose A depends on joints that are not free.
     """
     _check("certify_regular", mech, at_least)
-    box = _Box(mech, ranges)
+    box = Box(mech, ranges)
     if box.equations != box.n:
         raise ValueError(
             f"certify_regular needs as many equations as coordinates, {type(mech).__name__} has others"
@@ -98,7 +86,7 @@ def certify_regular(
     scale = abs(at_home) if scale is None else scale
     within = _margins_named(mech, within) if len(within) else ()
     settle = partial(_regular, box, scale, within, at_least, np.sign(at_centre))
-    return _bisected(box, settle, [box.whole], most, report, "no singularity")
+    return bisected(box, settle, [box.whole], most, report, "no singularity")
 
 
 def certify_confined(
@@ -129,11 +117,9 @@ def certify_confined(
     names = coordinate_names(mech)
     if missing := [name for name in names if name not in ranges]:
         raise ValueError(f"ranges must have every coordinate of the pose, {', '.join(missing)} missing")
-    free = (
-        dict(zip(_free_names(mech), np.asarray(mech.free_range()), strict=True)) if mech.free_joints else {}
-    )
-    box = _Box(mech, {**ranges, **free})
-    _check_chart(box)
+    free = dict(zip(free_names(mech), np.asarray(mech.free_range()), strict=True)) if mech.free_joints else {}
+    box = Box(mech, {**ranges, **free})
+    check_chart(box)
     whole_lower, whole_upper = box.whole
     at_home = box.home[: len(names)]
     if not np.all((whole_lower[: len(names)] < at_home) & (at_home < whole_upper[: len(names)])):
@@ -148,7 +134,7 @@ def certify_confined(
     if not float(jnp.min(_margins(mech, mech.home(), jnp.asarray(box.home), within))) >= 0:
         raise ValueError("home must be inside the margins, it is not")
     settle = partial(_excluded, box, within, at_least)
-    return _bisected(box, settle, faces, most, report, "no way out")
+    return bisected(box, settle, faces, most, report, "no way out")
 
 
 def _check(function: str, mech: Any, at_least: Any) -> None:
@@ -157,73 +143,6 @@ def _check(function: str, mech: Any, at_least: Any) -> None:
         raise ValueError("a certificate needs known values in float64: call pk_jax.enable_x64() first")
     if not (np.ndim(at_least) == 0 and np.isfinite(at_least) and at_least >= 0):
         raise ValueError(f"at_least must be a finite number >= 0, got {at_least}")
-
-
-# --- boxes of coordinates
-
-
-class _Box:
-    """The box that a user names, and functions of its coordinates (pose, then free joints)."""
-
-    def __init__(self, mech: Mechanism, ranges: Mapping[str, Sequence[float]]) -> None:
-        self.mech = mech
-        pose, joints = mech.home()
-        self.names = (*coordinate_names(mech), *_free_names(mech))
-        self.n = tangent_size(pose)
-        self.equations = jax.eval_shape(mech.residual, pose, joints).shape[0]
-        at = coordinates_of(jax.tree.map(lambda leaf: leaf[None], pose))[0]
-        self.home = np.append(at, np.asarray(joints)[len(joints) - mech.free_joints :])
-        lower, upper = self.home.copy(), self.home.copy()
-        for name, given in ranges.items():
-            if name not in self.names:
-                raise ValueError(f"ranges must name some of {', '.join(self.names)}, got {name!r}")
-            ends = checks.real_numpy(f"ranges[{name!r}]", given).astype(float)
-            if ends.shape != (2,) or not np.all(np.isfinite(ends)) or not ends[0] <= ends[1]:
-                got = " ".join(str(given).split())
-                raise ValueError(f"ranges[{name!r}] must be (lower, upper), lower <= upper, got {got}")
-            place = self.names.index(name)
-            lower[place], upper[place] = ends
-        self.whole = lower, upper
-
-    def at_home(self, boxes: int | None = None) -> tuple[Any, Any]:
-        """The home pose, and joints of which nothing is known, so that none can have a say unnoticed."""
-        pose, joints = self.mech.home()
-        if boxes is None:
-            return pose, jnp.full_like(joints, jnp.nan)
-        nothing = np.full((boxes, len(joints)), np.nan)
-        return pose, Interval(nothing, nothing)
-
-    def enclosed(self, function: Callable, lower: np.ndarray, upper: np.ndarray) -> Any:
-        """Bounds of `function(mech, home, coordinates)` over boxes (k, d); NaN where it may jump."""
-        box = Interval(lower, upper)
-        try:
-            return enclosure(function, self.mech, self.at_home(len(lower)), box, is_sure=True)
-        except UnknownPrimitive as error:
-            what = f"{type(self.mech).__name__}: there are no bounds of the primitive {error}"
-            raise ValueError(f"no certificate for {what}") from None
-
-
-def _free_names(mech: Mechanism) -> tuple[str, ...]:
-    m = home_shapes(mech)[1].shape[0]
-    names = mech.joint_names or tuple(f"q{i}" for i in range(1, m + 1))
-    return names[m - mech.free_joints :]
-
-
-def _check_chart(box: _Box) -> None:
-    limits = {"pitch": np.pi / 2, "roll": np.pi, "yaw": np.pi, "phi": np.pi}
-    for name, low, high in zip(box.names, *box.whole, strict=True):
-        if max(abs(low), abs(high)) >= limits.get(name, np.inf):
-            raise ValueError(f"ranges[{name!r}] must be inside +-{limits[name]:.6g} rad, got ({low}, {high})")
-
-
-def _pose_at(home: Any, values: jax.Array) -> Any:
-    """The pose of coordinates; `rotations.from_rotation_vector` has two formulas, intervals want one."""
-    if isinstance(home, AxisPose):
-        return AxisPose(values[0], rotations.from_angles(values[1:4]))
-    if isinstance(home, SE3):
-        start = SE3(jnp.zeros_like(home.translation), home.rotation)
-        return retract(start, values[:6])
-    return values[: home.shape[0]]
 
 
 # --- one box: A is regular
@@ -235,7 +154,7 @@ def _matrix(mech: Mechanism, home: Any, values: jax.Array) -> jax.Array:
     pose, joints = home
     count = mech.free_joints
     joints = jnp.concatenate([joints[: joints.shape[0] - count], values[values.shape[0] - count :]])
-    return mech.linearize(_pose_at(pose, values), joints)[1]
+    return mech.linearize(pose_at(pose, values), joints)[1]
 
 
 @jax.jit
@@ -243,26 +162,17 @@ def _matrix_slopes(mech: Mechanism, home: Any, values: jax.Array) -> jax.Array:
     return jax.jacfwd(lambda v: _matrix(mech, home, v))(values)
 
 
-class _Settled(NamedTuple):
-    """What is known of boxes (k,)."""
-
-    bound: np.ndarray  # proved; NaN: nothing is
-    is_done: np.ndarray
-    spread: np.ndarray  # (k, d) how much each coordinate contributes to what is not known
-    is_lost: bool  # at some point the contrary holds
-
-
 def _regular(
-    box: _Box,
+    box: Box,
     scale: Callable | float,
     within: tuple[str, ...],
     least: float,
     sign: float,
     lower: np.ndarray,
     upper: np.ndarray,
-) -> _Settled:
+) -> Settled:
     """|det A| / scale bounded from below, over each box."""
-    middle, half = _halved(lower, upper)
+    middle, half = halved(lower, upper)
     natural, at_middle = (box.enclosed(_matrix, *ends) for ends in ((lower, upper), (middle, middle)))
     slopes = box.enclosed(_matrix_slopes, lower, upper)
     near = at_middle.middle
@@ -282,7 +192,7 @@ def _regular(
         is_done |= box.enclosed(_Margins(within), lower, upper).upper.min(axis=1) < 0
         bound = np.where(is_done & ~(bound > least), np.inf, bound)
     is_lost = not within and bool(np.any(signs * sign <= 0))  # det A changes its sign in the box
-    return _Settled(bound, is_done, changes.sum(axis=(1, 2)), is_lost)
+    return Settled(bound, is_done, changes.sum(axis=(1, 2)), is_lost)
 
 
 def _unknown(natural: Interval) -> np.ndarray:
@@ -307,10 +217,10 @@ def _dominant(size: np.ndarray) -> np.ndarray:
 
 
 def _excluded(
-    box: _Box, within: tuple[str, ...], least: float, lower: np.ndarray, upper: np.ndarray
-) -> _Settled:
+    box: Box, within: tuple[str, ...], least: float, lower: np.ndarray, upper: np.ndarray
+) -> Settled:
     """A bound of how negative the least margin is, over each box."""
-    middle, half = _halved(lower, upper)
+    middle, half = halved(lower, upper)
     function = _Margins(within)
     natural, at_middle = (box.enclosed(function, *ends) for ends in ((lower, upper), (middle, middle)))
     slopes = box.enclosed(function.slopes, lower, upper)  # (k, margins, d)
@@ -323,7 +233,7 @@ def _excluded(
     combined = over(value, total(thin(weights), axis=1)).upper
     bound = -np.fmin(natural.upper.min(axis=1), combined)
     is_lost = bool(np.any(at_middle.lower.min(axis=1) >= -least))
-    return _Settled(bound, bound > least, changes, is_lost)
+    return Settled(bound, bound > least, changes, is_lost)
 
 
 def _weights(values: np.ndarray, slopes: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -375,7 +285,7 @@ class _Margins:
 
 @partial(jax.jit, static_argnums=3)
 def _margins(mech, home, values, names):
-    pose = _pose_at(home[0], values)
+    pose = pose_at(home[0], values)
     free = values[values.shape[0] - mech.free_joints :] if mech.free_joints else None
     found = mech.margins(pose, mech.inverse(pose, free=free))
     return jnp.concatenate([jnp.ravel(found[name]) for name in names])
@@ -384,54 +294,3 @@ def _margins(mech, home, values, names):
 @partial(jax.jit, static_argnums=3)
 def _margin_slopes(mech, home, values, names):
     return jax.jacfwd(lambda v: _margins(mech, home, v, names))(values)
-
-
-# --- bisection
-
-
-def _bisected(
-    box: _Box,
-    settle: Callable[[np.ndarray, np.ndarray], _Settled],
-    starts: Sequence[tuple[np.ndarray, np.ndarray]],
-    most: int,
-    report: Report | None,
-    what: str,
-) -> Certificate:
-    """Settle the boxes, those that are not in two halves, until none is left."""
-    say = report or (lambda *_: None)
-    most = checks.is_count("most", most, most=10**9)
-    lower, upper = (np.stack(ends) for ends in zip(*starts, strict=True))
-    bound, examined, is_lost = np.inf, 0, False
-    while len(lower) and examined < most and not is_lost:
-        count = min(AT_A_TIME, most - examined, len(lower))
-        here = slice(len(lower) - count, len(lower))  # the last ones: depth first, few are kept
-        low, high = lower[here], upper[here]
-        with np.errstate(all="ignore"):  # NaN is what is not known
-            found = settle(low, high)
-        examined += len(low)
-        is_lost = found.is_lost
-        bound = min(bound, np.min(found.bound[found.is_done], initial=np.inf))
-        open_low, open_high = low[~found.is_done], high[~found.is_done]
-        spread = np.where(open_high > open_low, found.spread[~found.is_done], -1.0)
-        spread = np.where(np.isnan(spread), np.inf, spread)
-        rows, axis = np.arange(len(open_low)), np.argmax(spread, axis=1)
-        cut = _halved(open_low, open_high)[0][rows, axis]
-        is_lost |= not np.all(
-            (open_low[rows, axis] < cut) & (cut < open_high[rows, axis])
-        )  # nothing to bisect
-        below, above = open_high.copy(), open_low.copy()
-        below[rows, axis] = above[rows, axis] = cut
-        lower = np.concatenate([lower[: here.start], open_low, above])
-        upper = np.concatenate([upper[: here.start], below, open_high])
-        say(f"{what}: boxes", examined, examined + len(lower))
-    is_proved = not len(lower)
-    return Certificate(
-        is_proved, float(bound) if is_proved else np.nan, examined, box.names, *box.whole, (lower, upper)
-    )
-
-
-def _halved(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A point of each box near its middle, and how far from it the box reaches at most."""
-    middle = Interval(lower, upper).middle
-    ends = [minus(thin(upper), thin(middle)).upper, minus(thin(middle), thin(lower)).upper]
-    return middle, np.where(upper > lower, np.maximum(*ends), 0.0)

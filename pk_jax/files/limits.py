@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from pk_jax.analysis.certificate import Certificate, certify_confined, certify_regular
+from pk_jax.analysis.boxes import Certificate
+from pk_jax.analysis.certificate import certify_confined, certify_regular
 from pk_jax.analysis.slices import coordinate_names
 from pk_jax.analysis.workspace_map import ANY, Travel, WorkspaceMap, travel, workspace_map
 from pk_jax.files.named import Named

@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pk_jax.analysis.certificate import Certificate, certify_confined, certify_regular
+from pk_jax.analysis.boxes import Certificate
+from pk_jax.analysis.certificate import certify_confined, certify_regular
 from pk_jax.analysis.singularity import SingularityKind
 from pk_jax.geometry.axis_pose import AxisPose
 from pk_jax.geometry.poses import place

@@ -21,7 +21,6 @@
 
 # %%
 # %matplotlib inline
-import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
@@ -141,16 +140,6 @@ figure
 steep = pk.AxisPose.from_angles(0.48, pitch=9 * DEG)
 found = pk.resolve_redundancy(machine, steep)
 print(f"E = {1e3 * float(found.free[0]):.3f} mm, smallest margin {float(found.value):.4f}")
-
-
-def best_carriage(pitch):
-    return pk.resolve_redundancy(machine, pk.AxisPose.from_angles(0.48, 0.0, pitch, 0.0)).free[0]
-
-
-x, h = 9 * DEG, 1e-5
-slope, difference = jax.jacfwd(best_carriage)(x), (best_carriage(x + h) - best_carriage(x - h)) / (2 * h)
-print(f"dE/dpitch {float(slope):.9f}, by differences {float(difference):.9f} m/rad")
-assert abs(slope - difference) < 1e-8
 
 # %% [markdown]
 # ## Singularities

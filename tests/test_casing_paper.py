@@ -283,7 +283,7 @@ def test_certify_proves_and_says_when_it_could_not(capsys):
 
 
 def test_certify_of_all_coordinates_proves_that_they_cannot_be_left(capsys):
-    spans = ("s=400:560", "roll=-0.5:0.5", "pitch=-0.5:0.5", "yaw=-0.5:0.5")
+    spans = ("s=400:560", "roll=-0.5:0.5", "pitch=-0.5:0.5", "yaw=-0.5:0.5")  # wide: few boxes
     ranges = [each for span in spans for each in ("--range", span)]
     arguments = ("certify", "casing-oscillator", "--unit", "mm", "--within", "stroke_min,stroke_max")
     code, out, _ = run(capsys, *arguments, *ranges)
@@ -294,12 +294,11 @@ def test_ik_takes_a_carriage_or_a_way_to_choose_it(capsys, tmp_path):
     rows = tmp_path / "poses.csv"
     rows.write_text("s,roll,pitch,yaw\n480,0.1,0.1,0\n470,0,-0.05,0.1\n")
     found = {}
-    for free in ("700", "margin", "middle"):
+    for free in ("700", "margin"):
         code, out, _ = run(capsys, "ik", "casing-oscillator", str(rows), "--unit", "mm", "--free", free)
         assert code == 0
         found[free] = np.array([[float(v) for v in line.split(",")[:5]] for line in out.splitlines()[1:]])
     assert np.all(found["700"][:, 4] == 700)
-    np.testing.assert_allclose(found["middle"][:, 4], (667.5 + 792.2) / 2, rtol=1e-15)
     pose = pk.AxisPose.from_angles(jnp.array([0.48, 0.47]), [0.1, 0.0], [0.1, -0.05], [0.0, 0.1])
     best = pk.resolve_redundancy(machine(), pose)
     np.testing.assert_allclose(found["margin"], 1e3 * np.asarray(best.joints), rtol=1e-12)

@@ -173,6 +173,7 @@ def inside(points, found):
 AROUND = np.linspace(0, 2 * np.pi, 400, endpoint=False)
 
 
+@pytest.mark.soak  # the laws of five-bars are checked in test_laws
 @pytest.mark.parametrize("name", FIVE)
 def test_five_bar_obeys_the_laws(name):
     is_lawful(FIVE[name], five(name))
@@ -315,7 +316,7 @@ def test_type_two_of_the_3_rrr_is_where_the_determinant_changes_sign(name, phi):
         assert np.max(np.linalg.svd(lines, compute_uv=False)[:, -1]) <= 1e-9
 
 
-@pytest.mark.parametrize("axes", [("x", "y"), ("x", "phi")])
+@pytest.mark.parametrize("axes", [("x", "y"), pytest.param(("x", "phi"), marks=pytest.mark.soak)])
 def test_type_two_of_the_3_rpr_is_where_the_determinant_changes_sign(axes):
     found = sauer(axes)
     is_lawful(SAUER, found)

@@ -331,9 +331,11 @@ def test_a_run_that_is_stopped_leaves_no_output(run, folder, monkeypatch, stop, 
         return real(columns)
 
     monkeypatch.setattr(stream, "format_rows", second_stops)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # shells ignore it in the background
     (folder / "a.csv").write_text("2,2\n" * 9)
     handlers = [signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGHUP)]
     found, out, err = run("fk", "nam-2-rpr", "a.csv", "-o", "out.csv", "--chunk", "4")
+    signal.signal(signal.SIGINT, before)
     assert found == code and out == "" and len(calls) == 2 and seen
     assert len(err.splitlines()) == 1
     assert not list(folder.glob(".*")) and not (folder / "out.csv").exists()

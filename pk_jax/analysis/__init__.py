@@ -1,1 +1,1 @@
-"""What follows from the Jacobians: local indices, and their integrals over the workspace."""
+"""What follows from the Jacobians: indices and their integrals, singularities, limits, and proofs about them."""

@@ -1,1 +1,1 @@
-"""What follows from the Jacobians: indices and their integrals, singularities, limits, and proofs about them."""
+"""What follows from the Jacobians: indices and their integrals, singularities, limits and proofs."""

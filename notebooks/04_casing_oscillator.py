@@ -28,6 +28,7 @@ from matplotlib.figure import Figure
 import pk_jax as pk
 from pk_jax.papers import casing_oscillator as paper
 from pk_jax.viz import casing_oscillator as viz
+from pk_jax.viz.singularity import singular_configurations
 from pk_jax.viz.workspace_map import draw_boundary, draw_map
 
 pk.enable_x64()  # the caller decides about float64, before the first array
@@ -159,18 +160,12 @@ for case in paper.singular_cases(machine):
     print(f"{case.title:27} {kind:8} sigma {float(found.sigma_direct):.1e}  det {ratios}")
 
 # %%
-from pk_jax.viz.singularity import draw_locus
+singular_configurations(paper.singular_cases(machine), columns=3)
 
-locus = pk.singularity_locus(machine, "pitch,yaw", ranges=[(-0.5, 1.8), (-1.2, 1.2)], nodes=41)
-lines = sorted(
-    {
-        round(float(c.coordinates[:, 0].mean()) / DEG, 9)
-        for c in locus.curves
-        if np.ptp(c.coordinates[:, 0]) < 1e-9
-    }
-)
-print("pitch of the branches that do not depend on yaw (deg):", lines)
-draw_locus(machine, locus)
+# %% [markdown]
+# Red is the axis about which the platform can still turn with all five joints locked; blue are the lines of
+# the legs. `pk.singularity_locus(machine, "pitch,yaw")` follows the whole curves, `pk-jax reproduce
+# casing-oscillator` draws them (Figs. 6 and 7).
 
 # %% [markdown]
 # ## The proof

@@ -282,6 +282,7 @@ def test_certify_proves_and_says_when_it_could_not(capsys):
     assert code == 5 and "NOT PROVED" in out
 
 
+@pytest.mark.soak
 def test_certify_of_all_coordinates_proves_that_they_cannot_be_left(capsys):
     spans = ("s=400:560", "roll=-0.5:0.5", "pitch=-0.5:0.5", "yaw=-0.5:0.5")  # wide: few boxes
     ranges = [each for span in spans for each in ("--range", span)]

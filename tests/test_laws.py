@@ -22,7 +22,13 @@ GOOD = {
 }
 
 
-@pytest.mark.parametrize("build", GOOD.values(), ids=GOOD.keys())
+SLOW = {"planar 3-RPR"}  # to compile; tests/test_planar_robots has another
+
+
+@pytest.mark.parametrize(
+    "build",
+    [pytest.param(build, id=name, marks=[pytest.mark.soak] * (name in SLOW)) for name, build in GOOD.items()],
+)
 def test_laws_hold(build):
     report = pk.check_mechanism(build())
     assert len(report) >= 19

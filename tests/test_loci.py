@@ -425,6 +425,7 @@ def four_is_lawful(found):
 FOUR_BOX = ((-0.31, 0.31), (-0.31, 0.31), (-np.pi, np.pi))
 
 
+@pytest.mark.soak  # notebook 03 draws them, too
 def test_type_two_of_the_4_rrr_are_curves():
     found = four(25)
     four_is_lawful(found)

@@ -79,7 +79,7 @@ LAWFUL = {
 }
 
 
-SLOW = {"4-rrr", "sauer-3-rpr", "arte-3-rpr"}  # to compile; other arms and legs obey the same code
+SLOW = {"4-rrr", "5-link", "5-link, coaxial"}  # to compile; other arms and legs obey the same code
 
 
 @pytest.mark.parametrize(

@@ -331,15 +331,22 @@ def test_a_run_that_is_stopped_leaves_no_output(run, folder, monkeypatch, stop, 
         return real(columns)
 
     monkeypatch.setattr(stream, "format_rows", second_stops)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # shells ignore it in the background
+    usual = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
+    before = {each: signal.signal(each, how) for each, how in usual.items()}  # nohup and & ignore some
     (folder / "a.csv").write_text("2,2\n" * 9)
     handlers = [signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGHUP)]
     found, out, err = run("fk", "nam-2-rpr", "a.csv", "-o", "out.csv", "--chunk", "4")
-    signal.signal(signal.SIGINT, before)
+    kept = [signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGHUP)]
+    for each, how in before.items():
+        signal.signal(each, how)
     assert found == code and out == "" and len(calls) == 2 and seen
     assert len(err.splitlines()) == 1
     assert not list(folder.glob(".*")) and not (folder / "out.csv").exists()
-    assert [signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGHUP)] == handlers
+    assert kept == handlers
 
 
 def test_a_path_that_only_looks_like_a_catalogue_entry(run, folder):

@@ -200,6 +200,7 @@ def test_gradients_against_central_differences():
         assert np.max(np.abs(slopes()(designs)[:, :, j] - central)) < 1e-6
 
 
+@pytest.mark.soak
 def test_gradients_beside_a_degenerate_curve():
     """lb = sqrt 2 (1 + la): panel borders that followed the design there would miss by 1e-5."""
     designs = np.array([[2.1658333333333335, 0.37397623938651525], [2.315, 0.4490490886451058]])
@@ -215,6 +216,7 @@ def test_gradients_are_finite_everywhere():
     assert np.all(np.isfinite(slopes()(scan())))
 
 
+@pytest.mark.soak
 def test_gradients_at_the_lower_limits_are_one_sided():
     """l_min = R and la = R are where most optima lie; a clipped function would halve them."""
     value = lambda l_min: pk.workspace_indices(two_rpr(l_min))

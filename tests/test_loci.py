@@ -316,7 +316,8 @@ def test_type_two_of_the_3_rrr_is_where_the_determinant_changes_sign(name, phi):
         assert np.max(np.linalg.svd(lines, compute_uv=False)[:, -1]) <= 1e-9
 
 
-@pytest.mark.parametrize("axes", [("x", "y"), pytest.param(("x", "phi"), marks=pytest.mark.soak)])
+@pytest.mark.soak  # the 3-RRR is sought in the same way
+@pytest.mark.parametrize("axes", [("x", "y"), ("x", "phi")])
 def test_type_two_of_the_3_rpr_is_where_the_determinant_changes_sign(axes):
     found = sauer(axes)
     is_lawful(SAUER, found)
@@ -436,6 +437,7 @@ def test_type_two_of_the_4_rrr_are_curves():
     np.testing.assert_allclose(total(four(33)), total(found), rtol=0.01)
 
 
+@pytest.mark.soak
 def test_type_two_of_the_4_rrr_in_a_plane_are_points():
     longest = max(four(25).curves, key=lambda curve: len(curve.sigma))
     k = len(longest.sigma) // 2

@@ -71,10 +71,7 @@ def report_into(
             folder.write_figure(f"fig{number}_{other}_yaw.png", _orientations(mech, other))
         for number, other in ((6, "roll"), (7, "pitch")):
             say(f"locus over {other} and yaw")
-            folder.write_figure(
-                f"fig{number}_locus_{other}_yaw.png",
-                draw_locus(mech, singularity_locus(mech, f"{other},yaw")),
-            )
+            folder.write_figure(f"fig{number}_locus_{other}_yaw.png", _locus(mech, other))
         folder.write_figure("fig8_fig9_singular.png", singular_configurations(cases, 3))
         show(f"\ntables and figures: {folder.path}")
     return proof.is_proved and all(kind == expected for _, kind, expected, *_ in rows)

@@ -88,10 +88,10 @@ def _forward(options: argparse.Namespace) -> int:
 
 
 def _inverse(options: argparse.Namespace) -> int:
-    return _convert(options, "inverse_rows")
+    return _convert(options, "inverse_rows", free=options.free)
 
 
-def _convert(options: argparse.Namespace, function: str) -> int:
+def _convert(options: argparse.Namespace, function: str, **more: str | None) -> int:
     progress = _begin()
     from pk_jax.files import stream
     from pk_jax.files.named import named_mechanism
@@ -108,7 +108,7 @@ def _convert(options: argparse.Namespace, function: str) -> int:
             options.out,
             columns=options.columns,
             chunk=options.chunk,
-            **({} if options.free is None else {"free": options.free}),
+            **more,
             note=(lambda _: None) if to_terminal else progress.note,
         )
     finally:
@@ -431,9 +431,7 @@ def _parser() -> argparse.ArgumentParser:
 
     named = "a catalogue entry (see: pk-jax list) or a TOML file"
     unit = "of lengths: m, mm, cm, in or um (default: the file's own, m for a catalogue entry)"
-    free = (
-        "kinematically redundant joints, or margin or conditioning: what to choose them by (default: home's)"
-    )
+    free = "redundant joint, or margin, conditioning or middle: what to choose it by (default: as at home)"
     for name, run, rows, text in (
         ("fk", _forward, "joints", "forward kinematics of rows of joints (CSV in, CSV out)"),
         ("ik", _inverse, "poses", "inverse kinematics of rows of poses (CSV in, CSV out)"),
@@ -451,8 +449,6 @@ def _parser() -> argparse.ArgumentParser:
         sub.add_argument("--unit", help=unit)
         if rows == "poses":
             sub.add_argument("--free", metavar="VALUE", help=free)
-        else:
-            sub.set_defaults(free=None)
         sub.add_argument(
             "--chunk", type=int, default=65536, metavar="N", help="rows at a time (default: %(default)s)"
         )
@@ -483,7 +479,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--at", metavar="X,Y,...", help="pose with the other coordinates (default: home)")
     span = "range of an axis, angles in rad"
     sub.add_argument("--range", action="append", default=[], metavar="A=LO:HI", help=span)
-    sub.add_argument("--free", metavar="VALUE", help=f"{free}; of a map: values")
+    sub.add_argument("--free", metavar="VALUE", help=f"{free}; for loci a value")
     sub.add_argument(
         "--mode", metavar="+-+", help="one working mode (default: all; with --pose: the mechanism's own)"
     )

@@ -29,7 +29,7 @@ def map_of(
     nodes: int | None,
 ) -> tuple[WorkspaceMap, dict[str, Travel]]:
     """The map that the command line says, and the travel of every coordinate about the same pose."""
-    mech, given = named.mechanism, ranges_of(named, ranges, with_free=True)
+    mech, given = named.mechanism, ranges_of(named, ranges)
     free = free if free in (None, ANY) else free_numbers(named, free, (ANY,))
     options = {"at": at, "branch": signs_of(mode), "free": free}
     travels = {name: travel(mech, name, **options) for name in coordinate_names(mech)}

@@ -8,6 +8,7 @@ the part of the order: near it, inverse @ matrix is near the identity and needs 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -144,3 +145,71 @@ def back_substitute(r: Matrix, right: list[Lane]) -> list[Lane]:
             x[i] = minus(x[i], times(r[i][j], x[j]))
         x[i] = over(x[i], r[i][i])
     return x
+
+
+# --- normal equations: half the work of orthogonalization, enough where steps are corrected by later ones
+
+NORMAL = "normal"
+
+
+def normal(rows: Matrix) -> Matrix:
+    """A^T A, symmetric. -> (n, n)"""
+    columns = list(zip(*rows, strict=True))
+    n = len(columns)
+    half = [[_dot(columns[i], columns[j]) for j in range(i + 1)] for i in range(n)]
+    return [[half[max(i, j)][min(i, j)] for j in range(n)] for i in range(n)]
+
+
+class Symmetric(NamedTuple):
+    """L D L^T of a positive definite matrix: unit L below the diagonal, reciprocals of D."""
+
+    lower: Matrix
+    reciprocals: list[Lane]
+
+
+def factor_symmetric(matrix: Matrix) -> Symmetric:
+    """Without pivots and roots."""
+    n = len(matrix)
+    lower: Matrix = [[0.0] * n for _ in range(n)]
+    pivots: list[Lane] = []
+    for i in range(n):
+        scaled = []  # L_ij D_j
+        for j in range(i):
+            scaled.append(minus(matrix[i][j], _dot(scaled[:j], lower[j][:j])))
+            lower[i][j] = times(scaled[j], pivots[j])
+        pivots.append(over(1.0, minus(matrix[i][i], _dot(scaled, lower[i][:i]))))
+    return Symmetric(lower, pivots)
+
+
+def solve_symmetric(factors: Symmetric, right: list[Lane]) -> list[Lane]:
+    """x with A x = right."""
+    lower, reciprocals = factors
+    n = len(lower)
+    x = list(right)
+    for i in range(n):
+        x[i] = minus(x[i], _dot(lower[i][:i], x[:i]))
+    x = [times(item, pivot) for item, pivot in zip(x, reciprocals, strict=True)]
+    for i in reversed(range(n)):
+        x[i] = minus(x[i], _dot([lower[k][i] for k in range(i + 1, n)], x[i + 1 :]))
+    return x
+
+
+def inverse_symmetric(factors: Symmetric) -> Matrix:
+    """A^-1 = K^T D^-1 K with K = L^-1, symmetric."""
+    lower, reciprocals = factors
+    n = len(lower)
+    k: Matrix = [[0.0] * n for _ in range(n)]
+    for j in range(n):
+        k[j][j] = 1.0
+        for i in range(j + 1, n):
+            k[i][j] = minus(0.0, _dot(lower[i][j:i], [k[m][j] for m in range(j, i)]))
+    scaled = [[times(item, pivot) for item in row] for row, pivot in zip(k, reciprocals, strict=True)]
+    entry = lambda i, j: _dot(
+        [k[m][i] for m in range(max(i, j), n)], [scaled[m][j] for m in range(max(i, j), n)]
+    )
+    half = [[entry(i, j) for j in range(i + 1)] for i in range(n)]
+    return [[half[max(i, j)][min(i, j)] for j in range(n)] for i in range(n)]
+
+
+def _dot(a: Sequence[Lane], b: Sequence[Lane]) -> Lane:
+    return total([times(x, y) for x, y in zip(a, b, strict=True)])

@@ -240,8 +240,8 @@ def _known(mech: Mechanism, joints: Any, guess: Any) -> ForwardKinematics | None
         solved = jax.device_put(solved)
         return ForwardKinematics(*solved, solved.pose)
     is_bad = solved.status == Status.BAD_INPUT
-    pose = _blanked(solved.pose, is_wrong)
-    residual, sigma_min, det_sign, candidate = _blanked(
+    pose = blanked(solved.pose, is_wrong)
+    residual, sigma_min, det_sign, candidate = blanked(
         (solved.residual, solved.sigma_min, solved.det_sign, solved.pose), is_bad
     )
     found = ForwardKinematics(pose, solved.status, residual, solved.steps, sigma_min, det_sign, candidate)
@@ -280,7 +280,7 @@ def _persist_rows(mech, home, joints, guess, found):
     return jax.vmap(partial(_persist, mech, home))(joints, guess, found)
 
 
-def _blanked(tree: Any, rows: np.ndarray) -> Any:
+def blanked(tree: Any, rows: np.ndarray) -> Any:
     """The same arrays, with NaN in some rows."""
     if not rows.any():
         return tree

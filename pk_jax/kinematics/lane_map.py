@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -18,28 +19,42 @@ from pk_jax.kinematics.lanes import Lane, split, split_rows
 Function = Callable[..., list[Lane]]  # of a mechanism and a row, both made of Entries
 
 
-def lane_map(function: Function, mech: Any, rows: tuple) -> np.ndarray:
+def lane_map(
+    function: Function, mech: Any, rows: tuple, shapes: Sequence[tuple[int, ...]] | None = None
+) -> Any:
     """`function(mech, *row)`, a list of lanes, of every row. -> (values, rows)
 
-    rows: trees of NumPy arrays (batch, ...). The program is compiled once for all numbers of rows, and for
+    rows:    trees of NumPy arrays (batch, ...)
+    shapes:  what the values are, one after the other: then a list of arrays (batch, *shape)
+
+    The program is compiled once for all numbers of rows, and for
     each `function`, which must be one object from call to call.
     """
     mech_leaves, mech_tree = jax.tree.flatten(mech)
     leaves, tree = jax.tree.flatten(rows)
     count = len(leaves[0])
-    shapes = tuple((leaf.shape, leaf.dtype) for leaf in mech_leaves)
+    mech_shapes = tuple((leaf.shape, leaf.dtype) for leaf in mech_leaves)
     row_shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in leaves)
     block = block_size()
-    run_block, out_like = _program(function, mech_tree, shapes, tree, row_shapes, block)
+    run_block, out_like = _program(function, mech_tree, mech_shapes, tree, row_shapes, block)
     mech_leaves = [jnp.asarray(leaf) for leaf in mech_leaves]
-    found = aligned((out_like.shape[0], count), out_like.dtype)
+    if shapes is None:
+        found = aligned((out_like.shape[0], count), out_like.dtype)
+    else:
+        found = [aligned((count, *shape), out_like.dtype) for shape in shapes]
+        cuts = np.cumsum([0, *map(math.prod, shapes)])
 
     def run(first: int, last: int) -> None:
-        given = [jnp.asarray(padded(leaf[first:last], block)) for leaf in leaves]
-        out = np.asarray(
-            run_block([*mech_leaves, *given, size_of(last - first)])[0]
-        )  # (chunks, values, lanes)
-        found[:, first:last] = out.transpose(1, 0, 2).reshape(out.shape[1], -1)[:, : last - first]
+        rows, size = slice(first, last), last - first
+        given = [jnp.asarray(padded(leaf[rows], block)) for leaf in leaves]
+        out = np.asarray(run_block([*mech_leaves, *given, size_of(size)])[0])  # (chunks, values, lanes)
+        if shapes is None:
+            found[:, rows] = out.transpose(1, 0, 2).reshape(out.shape[1], -1)[:, :size]
+            return
+        out = out[: -(-size // out.shape[2])]
+        for array, begin, end in zip(found, cuts, cuts[1:], strict=False):
+            part = out[:, begin:end].transpose(0, 2, 1)
+            array[rows] = part.reshape(-1, *array.shape[1:])[:size]
 
     if count:
         in_blocks(run, count, block)

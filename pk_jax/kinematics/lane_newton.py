@@ -171,11 +171,17 @@ def sign_of_det(jacobian: Any, actuated: int | None) -> Any:
 
 
 def iterate(
-    mech: Any, joints: Entries, start: Any, by: Order | Reference | None, first: Matrix | None, equations: int
+    mech: Any,
+    joints: Entries,
+    start: Any,
+    by: Order | Reference | str | None,
+    first: Matrix | None,
+    equations: int,
 ) -> Ended:
     """At most `STEPS` clipped Newton steps from `start`, all arguments made of `Entries`.
 
-    by:    how A is eliminated; None where its actuated rows are redundant
+    by:    how A is eliminated; None where its actuated rows are redundant: orthogonally, or by
+           `elimination.NORMAL`
     first: inverse of A (n, c) at the start, where it is known; spares the first elimination
     """
     like = joints.items[0]
@@ -273,7 +279,11 @@ def first_step(mech: Any, joints: Entries, start: Any, by: Order | Reference | N
     return _least_squares(jacobian.rows(), value.items, by)
 
 
-def _least_squares(rows: Matrix, value: list[Lane], by: Order | Reference | None) -> list[Lane]:
+def _least_squares(rows: Matrix, value: list[Lane], by: Order | Reference | str | None) -> list[Lane]:
+    if by == elimination.NORMAL:
+        columns = zip(*rows, strict=True)
+        right = [total([times(a, f) for a, f in zip(column, value, strict=True)]) for column in columns]
+        return elimination.solve_symmetric(elimination.factor_symmetric(elimination.normal(rows)), right)
     if len(rows) == len(rows[0]):
         return elimination.solve(elimination.factor(rows, by), value)
     return elimination.back_substitute(*elimination.orthogonalize(rows, value))

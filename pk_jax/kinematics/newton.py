@@ -73,7 +73,9 @@ def solve(
         value, jacobian = linearize(point)
         # NaN compares False, so a step into the void is refused like any other bad one
         is_small = longest < tiny
-        improves = jnp.linalg.norm(value) < jnp.linalg.norm(state.value)
+        # near the least of a |F| that is not zero, a good step changes it by less than roundoff
+        roundoff = tiny / 16 * jnp.linalg.norm(scaled)
+        improves = jnp.linalg.norm(value) < jnp.linalg.norm(state.value) + roundoff
         accept = improves | (is_small & jnp.all(jnp.isfinite(value)))
         chosen = jax.tree.map(
             lambda new, old: jnp.where(accept, new, old),

@@ -22,7 +22,7 @@ from pk_jax.geometry.poses import retract, tangent_size
 from pk_jax.geometry.se3 import SE3
 from pk_jax.kinematics import elimination, lane_newton, newton
 from pk_jax.kinematics.batching import is_possible, over_rows, rows_of, where, without_derivatives
-from pk_jax.kinematics.closed_form import closed_form, closed_form_on_lanes, mirrored
+from pk_jax.kinematics.closed_form import candidates, closed_form, closed_form_on_lanes, mirrored
 from pk_jax.kinematics.closure import pose_scale
 from pk_jax.kinematics.entrywise import entrywise
 from pk_jax.kinematics.forward import blanked
@@ -83,7 +83,7 @@ def nine_length_pose(
 
     Source: Ryu et al., patent application KR 10-2000-0073215, both embodiments.
     """
-    _require_nine_rows("nine_length_pose", stewart)
+    require_nine_rows("nine_length_pose", stewart)
     if method is not None and method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     is_known = checks.is_concrete((stewart, lengths, weights)) and not checks.is_staged()
@@ -95,13 +95,54 @@ def nine_length_pose(
         checks.is_finite("weights", weights)
         checks.is_positive("weights", weights)
     if checks.is_concrete(stewart):
-        method = _method_for(stewart, method)
+        method = _method_for("nine_length_pose", stewart, method)
     stage = known_stage(stewart) if checks.is_concrete(stewart) else None
     if is_known and method in ON_LANES:
         rows = np.broadcast_arrays(np.atleast_2d(lengths), weights)
         found = _known_rows(stewart, stage, *rows, method)
         return found if many or weighted else jax.tree.map(lambda leaf: leaf[0], found)
     return _solve(stewart, stage, (lengths, weights), (many, weighted), method)
+
+
+class NineLengthCandidates(NamedTuple):
+    """Every pose that the closed form offers; batch first, then the candidates, best first."""
+
+    poses: SE3  # (k,)
+    residual: jax.Array  # (k,) RMS error of the nine lengths there, before any Gauss-Newton step
+
+
+def nine_length_candidates(
+    stewart: Stewart, lengths: Any, *, method: str | None = None
+) -> NineLengthCandidates:
+    """All real candidates for nine lengths, and how far each is off them.
+
+    method:  "linear" (planar base): the pose and its mirror image, which fit alike; "quintic" (any other
+             base, default): one for the real part of each root, of which generically one fits;
+             "macaulay": one. All but "linear" add the pose that a planar base would have.
+
+    Lengths as for `nine_length_pose`; candidates of bad ones are NaN.
+    """
+    require_nine_rows("nine_length_candidates", stewart)
+    lengths, many = rows_of("lengths", lengths, jax.ShapeDtypeStruct((ROWS,), stewart.base.dtype))
+    if not checks.is_concrete(stewart):
+        raise ValueError("nine_length_candidates takes a Stewart with known values")
+    if method == "products":
+        raise ValueError("method 'products' offers no candidates to choose from; take 'macaulay'")
+    found = _method_for("nine_length_candidates", stewart, method)
+    method = "quintic" if method is None and found != "linear" else found
+    return _candidates(stewart, known_stage(stewart), lengths, many, method)
+
+
+@partial(jax.jit, static_argnums=(3, 4))
+def _candidates(stewart, stage, lengths, many, method):
+    def one(lengths):
+        given = jnp.where(is_possible(stewart, lengths), lengths, jnp.nan)
+        poses = candidates(stage, given, method)[0]
+        off = jax.vmap(lambda pose: jnp.sqrt(jnp.mean((stewart.inverse(pose) - given) ** 2)))(poses)
+        order = jnp.argsort(off, stable=True)
+        return NineLengthCandidates(*jax.tree.map(lambda leaf: leaf[order], (poses, off)))
+
+    return over_rows(one, (lengths,), (many,))
 
 
 def known_stage(stewart: Stewart) -> Stage:
@@ -116,7 +157,7 @@ def known_stage(stewart: Stewart) -> Stage:
 _stages: WeakKeyDictionary[Stewart, Stage] = WeakKeyDictionary()
 
 
-def _require_nine_rows(function: str, stewart: Any) -> None:
+def require_nine_rows(function: str, stewart: Any) -> None:
     if not isinstance(stewart, Stewart):
         raise ValueError(f"{function} takes a pk_jax.Stewart, got {type(stewart).__name__}")
     if stewart.base.shape[0] != ROWS:
@@ -126,11 +167,11 @@ def _require_nine_rows(function: str, stewart: Any) -> None:
         )
 
 
-def _method_for(stewart: Stewart, method: str | None) -> str:
+def _method_for(function: str, stewart: Stewart, method: str | None) -> str:
     """The method that is asked for, or that suits the layout. ValueError where none can work."""
     stage = known_stage(stewart)
     if (reason := refusal(stage)) is not None:
-        raise ValueError(f"nine_length_pose: {reason}")
+        raise ValueError(f"{function}: {reason}")
     if bool(stage.is_planar):
         if method not in (None, "linear"):
             raise ValueError(

@@ -95,7 +95,7 @@ def nine_length_pose(
         checks.is_finite("weights", weights)
         checks.is_positive("weights", weights)
     if checks.is_concrete(stewart):
-        method = _method_for("nine_length_pose", stewart, method)
+        method = method_for("nine_length_pose", stewart, method)
     stage = known_stage(stewart) if checks.is_concrete(stewart) else None
     if is_known and method in ON_LANES:
         rows = np.broadcast_arrays(np.atleast_2d(lengths), weights)
@@ -128,7 +128,7 @@ def nine_length_candidates(
         raise ValueError("nine_length_candidates takes a Stewart with known values")
     if method == "products":
         raise ValueError("method 'products' offers no candidates to choose from; take 'macaulay'")
-    found = _method_for("nine_length_candidates", stewart, method)
+    found = method_for("nine_length_candidates", stewart, method)
     method = "quintic" if method is None and found != "linear" else found
     return _candidates(stewart, known_stage(stewart), lengths, many, method)
 
@@ -167,7 +167,7 @@ def require_nine_rows(function: str, stewart: Any) -> None:
         )
 
 
-def _method_for(function: str, stewart: Stewart, method: str | None) -> str:
+def method_for(function: str, stewart: Stewart, method: str | None) -> str:
     """The method that is asked for, or that suits the layout. ValueError where none can work."""
     stage = known_stage(stewart)
     if (reason := refusal(stage)) is not None:

@@ -18,6 +18,12 @@ if TYPE_CHECKING:
     from pk_jax.analysis.loci import singularity_locus as singularity_locus
     from pk_jax.analysis.redundancy import Redundancy as Redundancy
     from pk_jax.analysis.redundancy import resolve_redundancy as resolve_redundancy
+    from pk_jax.analysis.sensors import NoiseGain as NoiseGain
+    from pk_jax.analysis.sensors import NoiseGains as NoiseGains
+    from pk_jax.analysis.sensors import SensorLayout as SensorLayout
+    from pk_jax.analysis.sensors import noise_gains as noise_gains
+    from pk_jax.analysis.sensors import pose_covariance as pose_covariance
+    from pk_jax.analysis.sensors import sensor_layout as sensor_layout
     from pk_jax.analysis.singularity import Singularity as Singularity
     from pk_jax.analysis.singularity import SingularityKind as SingularityKind
     from pk_jax.analysis.singularity import classify_singularity as classify_singularity
@@ -29,11 +35,23 @@ if TYPE_CHECKING:
     from pk_jax.analysis.workspace_map import WorkspaceMap as WorkspaceMap
     from pk_jax.analysis.workspace_map import travel as travel
     from pk_jax.analysis.workspace_map import workspace_map as workspace_map
+    from pk_jax.control.loop import Simulation as Simulation
+    from pk_jax.control.loop import simulate_control as simulate_control
+    from pk_jax.control.plant import Gains as Gains
+    from pk_jax.control.plant import Plant as Plant
+    from pk_jax.control.reference import Reference as Reference
+    from pk_jax.control.reference import circle_reference as circle_reference
+    from pk_jax.control.reference import step_reference as step_reference
+    from pk_jax.design.calibration import Calibration as Calibration
+    from pk_jax.design.calibration import calibrate as calibrate
+    from pk_jax.design.calibration import stewart_from_log as stewart_from_log
     from pk_jax.design.objective import IndexBounds as IndexBounds
     from pk_jax.design.objective import composite_index as composite_index
     from pk_jax.design.optimize import DesignResult as DesignResult
     from pk_jax.design.optimize import index_bounds as index_bounds
     from pk_jax.design.optimize import optimize_design as optimize_design
+    from pk_jax.design.sensor_placement import SensorPlacement as SensorPlacement
+    from pk_jax.design.sensor_placement import place_sensors as place_sensors
     from pk_jax.design.variables import DesignSpace as DesignSpace
     from pk_jax.design.variables import design_space as design_space
     from pk_jax.files.mechanism_file import load_mechanism as load_mechanism
@@ -50,6 +68,10 @@ if TYPE_CHECKING:
     from pk_jax.kinematics.jacobian import self_motions as self_motions
     from pk_jax.kinematics.jacobian import velocity_jacobian as velocity_jacobian
     from pk_jax.kinematics.laws import check_mechanism as check_mechanism
+    from pk_jax.kinematics.nine_lengths import NineLengthCandidates as NineLengthCandidates
+    from pk_jax.kinematics.nine_lengths import NineLengthPose as NineLengthPose
+    from pk_jax.kinematics.nine_lengths import nine_length_candidates as nine_length_candidates
+    from pk_jax.kinematics.nine_lengths import nine_length_pose as nine_length_pose
     from pk_jax.kinematics.statics import BoundedForces as BoundedForces
     from pk_jax.kinematics.statics import Screws as Screws
     from pk_jax.kinematics.statics import bounded_joint_forces as bounded_joint_forces
@@ -94,6 +116,14 @@ _NAMES = {
         "Redundancy",
         "resolve_redundancy",
     ),
+    "pk_jax.analysis.sensors": (
+        "NoiseGain",
+        "NoiseGains",
+        "SensorLayout",
+        "noise_gains",
+        "pose_covariance",
+        "sensor_layout",
+    ),
     "pk_jax.analysis.singularity": (
         "Singularity",
         "SingularityKind",
@@ -111,6 +141,24 @@ _NAMES = {
         "travel",
         "workspace_map",
     ),
+    "pk_jax.control.loop": (
+        "Simulation",
+        "simulate_control",
+    ),
+    "pk_jax.control.plant": (
+        "Gains",
+        "Plant",
+    ),
+    "pk_jax.control.reference": (
+        "Reference",
+        "circle_reference",
+        "step_reference",
+    ),
+    "pk_jax.design.calibration": (
+        "Calibration",
+        "calibrate",
+        "stewart_from_log",
+    ),
     "pk_jax.design.objective": (
         "IndexBounds",
         "composite_index",
@@ -119,6 +167,10 @@ _NAMES = {
         "DesignResult",
         "index_bounds",
         "optimize_design",
+    ),
+    "pk_jax.design.sensor_placement": (
+        "SensorPlacement",
+        "place_sensors",
     ),
     "pk_jax.design.variables": (
         "DesignSpace",
@@ -146,6 +198,12 @@ _NAMES = {
         "velocity_jacobian",
     ),
     "pk_jax.kinematics.laws": ("check_mechanism",),
+    "pk_jax.kinematics.nine_lengths": (
+        "NineLengthCandidates",
+        "NineLengthPose",
+        "nine_length_candidates",
+        "nine_length_pose",
+    ),
     "pk_jax.kinematics.statics": (
         "BoundedForces",
         "Screws",

@@ -240,6 +240,32 @@ def _certify(options: argparse.Namespace) -> int:
     return 0 if all(each.is_proved for each in found.values()) else NUMERICAL
 
 
+def _calibrate(options: argparse.Namespace) -> int:
+    if options.out and Path(options.out).suffix.lower() != ".toml":
+        raise ValueError(f"-o must end in .toml, got {options.out!r}")
+    progress = _begin()
+    from pk_jax.files import calibrated
+    from pk_jax.files.shown import as_json
+    from pk_jax.status import Status
+
+    progress.say("identifying")
+    one = calibrated.identified(
+        options.log,
+        options.nominal,
+        options.unit,
+        offsets=options.offsets,
+        columns=options.columns,
+        angles=options.angles,
+    )
+    progress.close()
+    print(as_json(calibrated.identified_table(one)) if options.json else calibrated.identified_text(one))
+    if one.found.status not in (Status.OK, Status.SINGULAR):
+        return NUMERICAL  # it is on its way, and no geometry to keep
+    if options.out:
+        calibrated.save(options.out, one)
+    return 0 if one.found.status == Status.OK else NUMERICAL
+
+
 def _image_kind(path: str) -> str:
     kind = Path(path).suffix.lower().removeprefix(".")
     if kind not in ("png", "svg", "pdf"):
@@ -519,6 +545,33 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "--most", type=int, default=1_000_000, metavar="N", help="boxes to examine (default: %(default)s)"
     )
+
+    sub = command(
+        "calibrate", _calibrate, "identify a geometry from logged poses and joints, with standard deviations"
+    )
+    sub.add_argument("log", metavar="LOG.csv", help="poses and joints in one file, - for stdin")
+    sub.add_argument(
+        "--nominal",
+        metavar="GEOMETRY",
+        help=f"what to start from, {named} (default: a Stewart platform of six legs, from the log alone)",
+    )
+    sub.add_argument(
+        "--offsets", action="store_true", help="a constant of each joint, too; it is only printed"
+    )
+    sub.add_argument(
+        "--columns", metavar="A,B,...", help="which columns are the pose, then the joints: names or numbers"
+    )
+    sub.add_argument(
+        "--angles",
+        choices=("xyz", "xzy", "yxz", "yzx", "zxy", "zyx"),
+        help="poses are x,y,z,tx,ty,tz in degrees, turns multiplied in this order "
+        "(default: xyz, Rx Ry Rz, where columns are called so)",
+    )
+    sub.add_argument("--unit", help=unit)
+    sub.add_argument(
+        "-o", "--out", metavar="FILE", help="the geometry, a .toml; kept unless the search stopped"
+    )
+    sub.add_argument("--json", action="store_true", help="machine-readable")
 
     command("list", _list, "the catalogue of published designs")
     return parser

@@ -19,8 +19,8 @@ from pk_jax.control.plant import (
     drawn,
     driven,
     read,
+    variances_of,
     weights_of,
-    white_variances,
 )
 from pk_jax.control.reference import Reference
 from pk_jax.geometry import safe
@@ -70,11 +70,11 @@ def simulate_control(
     """Closed-loop motion of a nine-length platform whose six legs are rate-controlled.
 
     stewart:    nine rows: what the controller believes; the machine differs by `plant`'s errors
-    reference:  `circle(...)` or `step(...)`
+    reference:  `circle_reference(...)` or `step_reference(...)`
     feedback:   "joint": leg lengths alone; "legs": forward kinematics of six legs, Newton from the last
                 sample; "closed": the closed form of nine lengths; "nine": weighted least squares of
-                nine; "learned": the same, while a Kalman filter learns the constant errors of the legs
-                from what the nine lengths contradict one another along the way
+                nine; "learned": the same, while a Kalman filter learns the constant errors of the encoders
+                from how the nine lengths contradict one another along the way
     key:        of jax.random; seed i is drawn from `fold_in(key, i)`, whatever the number of seeds
     plant:      default `Plant()`
     gains:      default `Gains()`
@@ -89,7 +89,9 @@ def simulate_control(
     if feedback not in FEEDBACKS:
         raise ValueError(f"feedback must be one of {', '.join(FEEDBACKS)}, got {feedback!r}")
     if not isinstance(reference, Reference):
-        raise ValueError(f"reference must come from circle(...) or step(...), got {type(reference).__name__}")
+        raise ValueError(
+            f"reference must come from circle_reference or step_reference, got {type(reference).__name__}"
+        )
     plant, gains = plant or Plant(), gains or Gains()
     check_plant(plant)
     check_gains(gains)
@@ -148,16 +150,15 @@ def _sampled(stewart, start, pose_at, period, late, samples):
 
 
 class Learned(NamedTuple):
-    """Constant errors of the legs, as far as they are known."""
+    """Constant errors of the legs' encoders, as far as they are known."""
 
     bias: jax.Array  # (6,)
     variance: jax.Array  # (6, 6)
 
 
-def plant_errors(plant: Plant, like: jax.Array) -> jax.Array:
-    """What is known of the legs' constant errors before any is measured: their covariance. -> (6, 6)"""
-    variance = plant.encoder_bias**2 + 2 * plant.geometry_error**2
-    return jnp.diag(jnp.full_like(like, 1) * variance)
+def _unlearned(plant: Plant, like: jax.Array) -> Learned:
+    """What is known of the encoders before anything is measured."""
+    return Learned(0 * like, plant.encoder_bias**2 * jnp.eye(LEGS, dtype=like.dtype))
 
 
 class _Loop(NamedTuple):
@@ -202,7 +203,7 @@ def _run(stewart, stage, plant, gains, weights, sampled, key, *, feedback, metho
         integral=zero,
         error=zero,
         estimate=sampled.start,
-        learned=Learned(zero, plant_errors(plant, zero)),
+        learned=_unlearned(plant, zero),
         is_closed=jnp.asarray(True),
     )
 
@@ -280,7 +281,7 @@ def _learning(
     updates the errors as in a Kalman filter.
     """
     bias, variance = learned
-    legs, sensors = white_variances(plant)
+    legs, sensors = variances_of(plant)
     spread = jnp.diag(
         jnp.repeat(jnp.stack([legs, sensors]), np.array([LEGS, ROWS - LEGS]), total_repeat_length=ROWS)
     )
@@ -293,7 +294,7 @@ def _learning(
     off = corrected - stewart.inverse(pose)
     bias = bias + variance @ (weights @ off)[:LEGS]
     variance = variance - variance @ left[:LEGS, :LEGS] @ variance
-    return pose, Learned(bias, (variance + variance.T) / 2 + DRIFT**2 * plant_errors(plant, bias))
+    return pose, Learned(bias, (variance + variance.T) / 2 + DRIFT**2 * _unlearned(plant, bias).variance)
 
 
 def _summed_up(reference: Reference, plant: Plant, sampled: Sampled, runs: tuple) -> Simulation:

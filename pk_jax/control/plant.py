@@ -64,20 +64,20 @@ def check_gains(gains: Gains) -> None:
             raise ValueError(f"gains.{name} must be finite, got {value!r}")
 
 
-def white_variances(plant: Any) -> tuple[Any, Any]:
-    """Variances of the readings of a leg and of a sensor, without the constant errors of the legs.
+def variances_of(plant: Any) -> tuple[Any, Any]:
+    """Variances of the lengths of a leg and of a sensor, without the constant errors of the encoders.
 
     A joint's error moves a length by its component along it; there are two joints.
     """
     read = plant.noise**2 + plant.quantum**2 / 12 + TINIEST**2
-    return read, read + plant.sensor_bias**2 + 2 * plant.sensor_geometry_error**2
+    sensors = plant.sensor_bias**2 + 2 * plant.sensor_geometry_error**2
+    return read + 2 * plant.geometry_error**2, read + sensors
 
 
 def weights_of(plant: Plant) -> np.ndarray:
     """1 / variance of the nine lengths, from what is known of a plant's errors. -> (9,)"""
-    legs, sensors = white_variances(plant)
-    legs = legs + plant.encoder_bias**2 + 2 * plant.geometry_error**2
-    return np.repeat(1 / np.array([legs, sensors]), [LEGS, ROWS - LEGS])
+    legs, sensors = variances_of(plant)
+    return np.repeat(1 / np.array([legs + plant.encoder_bias**2, sensors]), [LEGS, ROWS - LEGS])
 
 
 class Errors(NamedTuple):

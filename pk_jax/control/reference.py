@@ -26,7 +26,7 @@ class Reference(NamedTuple):
     settled_after: float  # s; errors count from here on
 
 
-def circle(
+def circle_reference(
     mech: Mechanism,
     *,
     radius: float,
@@ -64,7 +64,7 @@ def circle(
     return Reference("circle", pose_at, start, float(duration), min(ramp + 0.5, (ramp + duration) / 2))
 
 
-def step(mech: Mechanism, twist: Any, *, centre: Any = None, duration: float = 0.5) -> Reference:
+def step_reference(mech: Mechanism, twist: Any, *, centre: Any = None, duration: float = 0.5) -> Reference:
     """A jump at time 0 from `centre` (default: home) by the tangent `twist` (6,): (v, w), w in rad."""
     start = _home_of(mech, centre)
     twist = checks.real_array("twist", twist).astype(start.translation.dtype)

@@ -11,7 +11,7 @@ from pk_jax.files.mechanism_file import UNITS
 
 
 class Column(NamedTuple):
-    """What is looked for: a name, and what its numbers are, "length", "angle" or "number"."""
+    """What is looked for: a name, and what its numbers are, "length", "angle", "degree" or "number"."""
 
     name: str
     kind: str
@@ -92,10 +92,11 @@ def _check_unit(where: str, name: str, column: Column, unit: str) -> None:
     suffix = name.rpartition("_")[2] if "_" in name else ""
     if column.kind == "number" or suffix not in _SUFFIXES:
         return
-    in_use = "rad" if column.kind == "angle" else unit
+    in_use = {"angle": "rad", "degree": "deg"}.get(column.kind, unit)
     if suffix != in_use:
-        said = "lengths without a unit" if in_use == "1" else f"{column.kind}s in {in_use}"
-        hint = "" if column.kind == "angle" else " (see --unit)"
+        what = "lengths" if column.kind == "length" else "angles"
+        said = "lengths without a unit" if in_use == "1" else f"{what} in {in_use}"
+        hint = " (see --unit)" if column.kind == "length" else ""
         raise ValueError(f"{where}: column {name!r} is in {suffix}, but what is read are {said}{hint}")
 
 

@@ -170,7 +170,7 @@ def free_numbers(named: Named, text: str, words: tuple[str, ...] = ()) -> np.nda
     if len(fields) != len(layout) or not all(map(is_number, fields)):
         wanted = ",".join(column.name for column in layout)
         raise ValueError(f"--free must be {' or '.join((f'numbers {wanted}', *words))}, got {text!r}")
-    return np.array([float(field) for field in fields]) * _scale(named, layout)
+    return np.array([float(field) for field in fields]) * scale_of(named, layout)
 
 
 def free_of(named: Named, text: str | None) -> Callable[..., tuple[jax.Array, jax.Array]]:
@@ -199,13 +199,13 @@ def free_of(named: Named, text: str | None) -> Callable[..., tuple[jax.Array, ja
 def pose_of(named: Named, text: str, option: str = "--pose") -> Any:
     """The pose that an option says, as a row of `ik`."""
     layout, row = parse_row(option, text, pose_layouts(named))
-    return jax.tree.map(lambda leaf: leaf[0], _as_pose(named, layout, row[None]))
+    return jax.tree.map(lambda leaf: leaf[0], as_pose(named, layout, row[None]))
 
 
 def pose_columns(named: Named, pose: Any) -> list[np.ndarray]:
     """The numbers of a batch of poses, in the unit of the user."""
     if not isinstance(pose, Turning):
-        return [*np.asarray(pose).T / _scale(named, _position(named))[:, None]]
+        return [*np.asarray(pose).T / scale_of(named, _position(named))[:, None]]
     quaternion, turn = map(np.asarray, _from_rotation(pose))
     quaternion = np.where(quaternion[:, :1] < 0, -quaternion, quaternion)
     return [*np.asarray(position(pose)).T / named.metres, *quaternion.T, *turn.T]
@@ -213,11 +213,11 @@ def pose_columns(named: Named, pose: Any) -> list[np.ndarray]:
 
 def joints_columns(named: Named, joints: Any) -> list[np.ndarray]:
     """The numbers of a batch of joints, in the unit of the user."""
-    return [*np.asarray(joints).T / _scale(named, joint_layouts(named)[0])[:, None]]
+    return [*np.asarray(joints).T / scale_of(named, joint_layouts(named)[0])[:, None]]
 
 
 def _forward(named: Named, pad: _Padding, layout: Layout, rows: np.ndarray) -> tuple[list[Any], np.ndarray]:
-    found = forward_kinematics(named.mechanism, rows * _scale(named, layout))
+    found = forward_kinematics(named.mechanism, rows * scale_of(named, layout))
     poses = jax.tree.map(lambda leaf: pad(np.asarray(leaf)), found.pose)
     numbers = [column[: len(rows)] for column in pose_columns(named, poses)]
     status, residual, steps, sigma, signs = (np.asarray(each) for each in found[1:6])
@@ -228,13 +228,13 @@ def _forward(named: Named, pad: _Padding, layout: Layout, rows: np.ndarray) -> t
 def _inverse(
     named: Named, pad: _Padding, solve: Callable, layout: Layout, rows: np.ndarray
 ) -> tuple[list[Any], np.ndarray]:
-    joints, status = (np.asarray(each)[: len(rows)] for each in solve(_as_pose(named, layout, pad(rows))))
+    joints, status = (np.asarray(each)[: len(rows)] for each in solve(as_pose(named, layout, pad(rows))))
     joints = np.where((status == Status.OK)[:, None], joints, np.nan)
     return [*joints_columns(named, joints), _names(status)], status
 
 
-def _as_pose(named: Named, layout: Layout, rows: np.ndarray) -> Any:
-    rows = rows * _scale(named, layout)
+def as_pose(named: Named, layout: Layout, rows: np.ndarray) -> Any:
+    rows = rows * scale_of(named, layout)
     kind = type(home_shapes(named.mechanism)[0])
     if kind not in _PLACE:
         return rows
@@ -259,7 +259,7 @@ def _from_rotation(pose: Any) -> tuple[jax.Array, jax.Array]:
     return jax.vmap(rotations.to_quaternion)(pose.rotation), jax.vmap(of_turn)(pose.rotation)
 
 
-def _scale(named: Named, layout: Layout) -> np.ndarray:
+def scale_of(named: Named, layout: Layout) -> np.ndarray:
     return np.array([named.metres if column.kind == "length" else 1.0 for column in layout])
 
 

@@ -149,17 +149,23 @@ figure
 # %%
 ramp = np.deg2rad(np.arange(0.37, 130.0))
 spin = np.stack([0 * ramp, 0 * ramp, ramp], axis=1)
-path = pk.SE3.from_rotation_vector(np.tile([0.0, 0.0, 1.0], (ramp.size, 1)), spin)
+path = pk.SE3(np.tile([0.0, 0.0, 1.0], (ramp.size, 1)), Rotation.from_rotvec(spin).as_matrix())
 lengths = pk.inverse_kinematics(robot, path).joints
 followed = pk.track(robot, lengths)
 last = int(followed.reached)
 print(f"followed to {np.degrees(ramp[last - 1]):.2f} deg, then {pk.Status(int(followed.status[last])).name}")
 
+
+def yaw_of(pose):
+    R = np.asarray(pose.rotation)
+    return np.degrees(np.arctan2(R[..., 1, 0], R[..., 0, 0]))
+
+
 naive, pose = [], robot.home()[0]
 for row in np.asarray(lengths):  # what residual tests alone would do
     step = pk.forward_kinematics(robot, row, pose)
     pose = step.candidate
-    naive.append((np.degrees(pose.rotation_vector()[2]), float(step.residual)))
+    naive.append((yaw_of(pose), float(step.residual)))
 naive = np.array(naive)
 print(f"warm-started Newton at 125 deg: yaw {naive[125, 0]:.1f} deg, residual {naive[125, 1]:.0e}")
 assert pk.Status(int(followed.status[last])) == pk.Status.SINGULAR and np.degrees(ramp[last - 1]) < 90
@@ -167,9 +173,7 @@ assert pk.Status(int(followed.status[last])) == pk.Status.SINGULAR and np.degree
 figure = Figure(figsize=(8, 3.2), layout="constrained")
 left, right = figure.subplots(1, 2)
 left.plot(np.degrees(ramp), naive[:, 0], color="#d55e00", label="Newton from the pose before")
-left.plot(
-    np.degrees(ramp), np.degrees(followed.pose.rotation_vector()[:, 2]), color="#0072b2", lw=3, label="track"
-)
+left.plot(np.degrees(ramp), yaw_of(followed.pose), color="#0072b2", lw=3, label="track")
 left.plot([0, 130], [0, 130], ":", color="#262626", label="the truth")
 left.set(xlabel="yaw of the platform (deg)", ylabel="yaw found (deg)")
 left.legend(frameon=False)
@@ -187,17 +191,15 @@ figure
 # %%
 home, lengths = robot.home()
 position = lambda robot, lengths: pk.forward_kinematics(robot, lengths).pose.translation
-by_length = jax.jacfwd(position, argnums=1)(robot, lengths)
-by_geometry = jax.jacrev(position)(robot, lengths)
+by_geometry, by_length = jax.jit(jax.jacrev(position, argnums=(0, 1)))(robot, lengths)
 print("metres of height per metre of each leg", np.round(by_length[2], 4))
 worst = np.sqrt(np.sum(np.asarray(by_geometry.base) ** 2, axis=(0, 2)))
 print("metres of position per metre of each base joint", np.round(worst, 3))
 step = 1e-5
-central = [
-    (position(robot, lengths + step * e) - position(robot, lengths - step * e)) / (2 * step)
-    for e in np.eye(6)
-]
-print("against central differences:", f"{np.abs(np.stack(central, axis=1) - by_length).max():.0e}")
+moved = lengths + step * np.concatenate([np.eye(6), -np.eye(6)])  # a batch
+ahead, behind = np.split(position(robot, moved), 2)
+central = (ahead - behind).T / (2 * step)
+print("against central differences:", f"{np.abs(central - by_length).max():.0e}")
 
 # %% [markdown]
 # ## A robot that nobody here thought of

@@ -22,7 +22,7 @@ GOOD = {
 }
 
 
-SLOW = {"planar 3-RPR"}  # to compile; tests/test_planar_robots has another
+SLOW = {"planar 3-RPR", "Delta robot"}  # to compile; test_planar_robots has one, notebook 02 the other
 
 
 @pytest.mark.parametrize(
@@ -37,6 +37,18 @@ def test_laws_hold(build):
 
 
 # ---------------------------------------------------------------- a good mechanism to break
+
+
+@pytest.fixture
+def compiled_in_haste():
+    """Every fault is compiled for itself and run once: without most optimizations that is sooner done."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
+IN_HASTE = pytest.mark.usefixtures("compiled_in_haste")
 
 
 class Slide(pk.Mechanism):
@@ -176,11 +188,13 @@ class Faulty(Slide):
         return jnp.stack([first, second]), jnp.array([True, True])
 
 
+@IN_HASTE
 def test_the_slide_itself_is_sound():
     assert pk.check_mechanism(Slide(gap=0.25))
     assert pk.check_mechanism(Faulty(gap=0.25, fault=0))
 
 
+@IN_HASTE
 @pytest.mark.parametrize("fault", list(FAULTS)[1:])
 def test_a_broken_law_is_named(fault):
     said = broken(Faulty(gap=0.25, fault=list(FAULTS).index(fault)))
@@ -213,6 +227,7 @@ class HiddenState(Slide):
         return poses - getattr(self, "offset", 0.0), is_real
 
 
+@IN_HASTE
 @pytest.mark.parametrize(
     ("mechanism", "law"),
     [(InfiniteDerivative, "derivatives in the geometry are finite"), (HiddenState, "pytree")],
@@ -239,6 +254,7 @@ LIBRARY = {
 }
 
 
+@IN_HASTE
 @pytest.mark.parametrize("law", LIBRARY)
 def test_a_fault_of_the_solvers_is_named(monkeypatch, law):
     name, change = LIBRARY[law]

@@ -119,10 +119,16 @@ def arms_of(mech, poses, joints):
 
 
 ARMED = {"3-rrr": lambda: arms(3), "4-rrr": lambda: catalogued("4-rrr"), "6-link": six_link}
-ARMED |= {"5-link": lambda: catalogued("5-link")}
+ARMED |= {"5-link": lambda: catalogued("5-link")}  # 4-rrr in make soak: arms as of the 3-rrr, one more
 
 
-@pytest.mark.parametrize("build", ARMED.values(), ids=ARMED.keys())
+@pytest.mark.parametrize(
+    "build",
+    [
+        pytest.param(build, id=name, marks=[pytest.mark.soak] * (name == "4-rrr"))
+        for name, build in ARMED.items()
+    ],
+)
 def test_every_working_mode_closes_the_loops_and_comes_back(build):
     mech = build()
     home, modes = np.asarray(mech.home()[0]), working_modes(mech)

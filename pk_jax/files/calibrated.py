@@ -13,7 +13,7 @@ from pk_jax.files.columns import Column, Layout
 from pk_jax.files.mechanism_file import UNITS, save_mechanism
 from pk_jax.files.named import Named, named_mechanism
 from pk_jax.files.rows_file import open_rows
-from pk_jax.files.stream import as_pose, scale_of, joint_layouts, pose_layouts
+from pk_jax.files.stream import as_pose, joint_layouts, pose_layouts, scale_of
 from pk_jax.geometry import rotations
 from pk_jax.geometry.se3 import SE3
 from pk_jax.kinematics.batching import home_shapes

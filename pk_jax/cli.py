@@ -84,6 +84,10 @@ def _stopped_by_signals() -> Iterator[None]:
 
 
 def _forward(options: argparse.Namespace) -> int:
+    if options.sigma and not options.closed_form:
+        raise ValueError("--sigma is for --closed-form")
+    if options.closed_form:
+        return _convert(options, "nine_length_rows", sigma=options.sigma)
     return _convert(options, "forward_rows")
 
 
@@ -266,6 +270,62 @@ def _calibrate(options: argparse.Namespace) -> int:
     return 0 if one.found.status == Status.OK else NUMERICAL
 
 
+def _simulate(options: argparse.Namespace) -> int:
+    kind = _image_kind(options.out) if options.out else None
+    progress = _begin()
+    from pk_jax.files import simulated
+    from pk_jax.files.atomic import output_file
+    from pk_jax.files.named import named_mechanism
+    from pk_jax.files.shown import as_json
+    from pk_jax.viz.nine_lengths import draw_tracking
+
+    named = named_mechanism(options.mechanism, options.unit)
+    feedbacks = simulated.feedbacks_of(options.feedback)
+    one = simulated.experiment_of(
+        named,
+        options.reference,
+        options.plant,
+        options.gain,
+        radius=options.radius,
+        frequency=options.frequency,
+        twist=options.twist,
+        duration=options.duration,
+    )
+    with contextlib.ExitStack() as stack:
+        image = stack.enter_context(output_file(options.out)) if options.out else None
+        table = stack.enter_context(output_file(options.csv)) if options.csv else None
+        runs = simulated.runs_of(one, feedbacks, options.seeds, options.seed, progress.say)
+        progress.close()
+        print(as_json(simulated.table_of(one, runs)) if options.json else simulated.table_text(one, runs))
+        if table:
+            table.write(simulated.samples_csv(one, runs).encode())
+        if image:
+            axes = draw_tracking(runs, scale=named.metres, unit="" if named.unit == "1" else named.unit)
+            axes.set_title(f"{Path(named.name).name}: {one.reference.name}")
+            axes.figure.savefig(image, format=kind, dpi=150)
+    is_ok = not any(row["not_ok"] for row in simulated.table_of(one, runs)["feedback"].values())
+    return 0 if is_ok else NUMERICAL
+
+
+def _sensors(options: argparse.Namespace) -> int:
+    if options.out and Path(options.out).suffix.lower() != ".toml":
+        raise ValueError(f"-o must end in .toml, got {options.out!r}")
+    progress = _begin()
+    from pk_jax.files.mechanism_file import save_mechanism
+    from pk_jax.files.named import named_mechanism
+    from pk_jax.files.sensed import sensed, sensed_text
+
+    named = named_mechanism(options.mechanism, options.unit)
+    one = sensed(named, options.place, options.place_platform, options.starts, progress)
+    progress.close()
+    print(sensed_text(named, one))
+    if one.layout.reason:
+        return NUMERICAL
+    if options.out:
+        save_mechanism(one.mechanism, options.out, unit=named.unit)
+    return 0
+
+
 def _image_kind(path: str) -> str:
     kind = Path(path).suffix.lower().removeprefix(".")
     if kind not in ("png", "svg", "pdf"):
@@ -295,6 +355,13 @@ def _reproduce(options: argparse.Namespace) -> int:
 
         out = options.out or "runs/casing-oscillator"
         is_right = casing_into(out, report=progress, say=progress.say, show=print)
+        progress.close()
+        return 0 if is_right else NUMERICAL
+    if options.paper == "nine-lengths":
+        from pk_jax.papers.nine_lengths_report import report_into as nine_lengths_into
+
+        out = options.out or "runs/nine-lengths"
+        is_right = nine_lengths_into(out, report=progress, say=progress.say, show=print)
         progress.close()
         return 0 if is_right else NUMERICAL
     from pk_jax.papers.nam2006_report import as_text, reproduce_into
@@ -411,7 +478,7 @@ def _with_pose_joined(arguments: Sequence[str]) -> list[str]:
     """`--pose -1,2` as `--pose=-1,2`: argparse would take the value for an option."""
     rest, joined = iter(arguments), []
     for each in rest:
-        value = next(rest, None) if each in ("--pose", "--at", "--mode", "--range") else None
+        value = next(rest, None) if each in ("--pose", "--at", "--mode", "--range", "--twist") else None
         joined.append(each if value is None else f"{each}={value}")
     return joined
 
@@ -434,9 +501,10 @@ def _parser() -> argparse.ArgumentParser:
         "paper",
         nargs="?",
         default="nam2006",
-        choices=("nam2006", "planar-screws", "casing-oscillator"),
+        choices=("nam2006", "planar-screws", "casing-oscillator", "nine-lengths"),
         help="default: %(default)s; planar-screws: singular poses and loci of the 5-link, k-RRR and 6-link; "
-        "casing-oscillator: its workspace, singularities, and the proof that they do not meet",
+        "casing-oscillator: its workspace, singularities, and the proof that they do not meet; nine-lengths: "
+        "the platform with three sensors, exact and noisy, and its loop",
     )
     sub.add_argument("--out", metavar="DIR", help="run folder (default: runs/PAPER)")
 
@@ -473,7 +541,16 @@ def _parser() -> argparse.ArgumentParser:
             "--columns", metavar="A,B,...", help=f"which columns are the {rows}: names or numbers"
         )
         sub.add_argument("--unit", help=unit)
-        if rows == "poses":
+        if rows == "joints":
+            sub.add_argument(
+                "--closed-form",
+                action="store_true",
+                help="of nine lengths: no guess, then weighted least squares",
+            )
+            sub.add_argument(
+                "--sigma", metavar="LEG,SENSOR", help="with it: standard deviations of the lengths"
+            )
+        else:
             sub.add_argument("--free", metavar="VALUE", help=free)
         sub.add_argument(
             "--chunk", type=int, default=65536, metavar="N", help="rows at a time (default: %(default)s)"
@@ -572,6 +649,53 @@ def _parser() -> argparse.ArgumentParser:
         "-o", "--out", metavar="FILE", help="the geometry, a .toml; kept unless the search stopped"
     )
     sub.add_argument("--json", action="store_true", help="machine-readable")
+
+    sub = command("simulate", _simulate, "the control loop of a nine-length platform, by every feedback")
+    sub.add_argument("mechanism", help=named)
+    sub.add_argument("--unit", help=unit)
+    sub.add_argument("--reference", choices=("circle", "step"), default="circle", help="default: %(default)s")
+    sub.add_argument("--radius", type=float, help="of the circle (default: a fifth of the platform's size)")
+    sub.add_argument("--frequency", type=float, default=0.5, help="of the circle, Hz (default: %(default)s)")
+    sub.add_argument("--twist", metavar="X,Y,Z,RX,RY,RZ", help="of the step, rad (default: small)")
+    sub.add_argument("--duration", type=float, help="s (default: 3; step: 0.5)")
+    sub.add_argument(
+        "--feedback", action="append", default=[], help="joint, legs, closed, nine or learned (default: all)"
+    )
+    sub.add_argument(
+        "--plant",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="period, delay, lag, rate_limit, noise, quantum, encoder_bias, sensor_bias, geometry_error or "
+        "sensor_geometry_error; s and the unit of lengths",
+    )
+    sub.add_argument(
+        "--gain",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="kp, ki, kd, feed_forward or anti_windup",
+    )
+    sub.add_argument("--seeds", type=int, default=20, help="machines (default: %(default)s)")
+    sub.add_argument("--seed", type=int, default=0, help="of the random numbers (default: %(default)s)")
+    sub.add_argument("--json", action="store_true", help="machine-readable")
+    sub.add_argument("-o", "--out", metavar="FILE", help="errors over time, a .png, .svg or .pdf")
+    sub.add_argument("--csv", metavar="FILE", help="every sample")
+
+    sub = command("sensors", _sensors, "rank, condition and noise gains of three length sensors; place them")
+    sub.add_argument("mechanism", help=f"{named}, with nine rows, or six to place sensors on")
+    sub.add_argument("--unit", help=unit)
+    sub.add_argument(
+        "--place", type=float, metavar="RADIUS", help="best base joints, within a square of this half-width"
+    )
+    sub.add_argument(
+        "--place-platform",
+        type=float,
+        metavar="RADIUS",
+        help="best platform joints, too, within such a square",
+    )
+    sub.add_argument("--starts", type=int, default=16, help="number of starts (default: %(default)s)")
+    sub.add_argument("-o", "--out", metavar="FILE", help="the platform with its sensors, a .toml")
 
     command("list", _list, "the catalogue of published designs")
     return parser

@@ -14,8 +14,8 @@ from pk_jax.geometry.poses import difference
 from pk_jax.geometry.se3 import SE3
 from pk_jax.kinematics.batching import home_shapes, over_rows, rows_of
 from pk_jax.kinematics.closed_form import closed_form
-from pk_jax.kinematics.linear_stage import Stage, condition_of, rank_of, stage_of
-from pk_jax.kinematics.nine_lengths import LengthErrors, known_stage, refusal, require_nine_rows
+from pk_jax.kinematics.linear_stage import Stage, stage_of
+from pk_jax.kinematics.nine_lengths import LengthErrors, known, require_nine_rows
 from pk_jax.mechanisms.stewart import LEGS, Stewart
 
 
@@ -41,16 +41,13 @@ def sensor_layout(stewart: Stewart) -> SensorLayout:
     require_nine_rows("sensor_layout", stewart)
     if not checks.is_concrete(stewart):
         raise ValueError("sensor_layout takes a Stewart with known values")
-    return layout_of(known_stage(stewart))
-
-
-def layout_of(stage: Stage) -> SensorLayout:
+    found = known(stewart)
     return SensorLayout(
-        "planar base" if bool(stage.is_planar) else "general base",
-        int(rank_of(stage)),
-        float(condition_of(stage)),
-        np.asarray(stage.singular_values),
-        refusal(stage),
+        "planar base" if bool(found.stage.is_planar) else "general base",
+        found.rank,
+        found.condition,
+        np.asarray(found.stage.singular_values),
+        found.refusal,
     )
 
 

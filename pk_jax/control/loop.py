@@ -28,7 +28,7 @@ from pk_jax.geometry.poses import difference, retract
 from pk_jax.geometry.se3 import SE3
 from pk_jax.kinematics.closed_form import closed_form
 from pk_jax.kinematics.linear_stage import ROWS
-from pk_jax.kinematics.nine_lengths import LengthErrors, known_stage, method_for, require_nine_rows
+from pk_jax.kinematics.nine_lengths import LengthErrors, known, method_for, require_nine_rows
 from pk_jax.mechanisms.stewart import LEGS, Stewart
 from pk_jax.status import Status
 
@@ -52,7 +52,9 @@ class Simulation(NamedTuple):
     rotation_error: jax.Array  # (seeds, n) rad
     rms_position: jax.Array  # (seeds,) over the samples that count
     rms_rotation: jax.Array  # (seeds,) rad
-    settling_time: jax.Array  # (seeds,) s from which on the error stays within 2 % of the first; NaN: never
+    settling_time: (
+        jax.Array
+    )  # (seeds,) s until the error stays within 2 % of the step; NaN: never, or no step
     status: jax.Array  # (seeds,) Status: OK, or STALLED where the platform's loops would not close
 
 
@@ -108,7 +110,7 @@ def simulate_control(
     numbers = jax.tree.map(lambda value: jnp.asarray(value, stewart.base.dtype), (plant, gains))
     runs = _run_all(
         stewart,
-        known_stage(stewart),
+        known(stewart).stage,
         *numbers,
         weights / jnp.max(weights),
         sampled,
@@ -117,7 +119,7 @@ def simulate_control(
         method,
         int(plant.delay),
     )
-    return _summed_up(reference, plant, sampled, runs)
+    return _summed_up(reference, plant, float(stewart.length()), sampled, runs)
 
 
 class Sampled(NamedTuple):
@@ -297,7 +299,7 @@ def _learning(
     return pose, Learned(bias, (variance + variance.T) / 2 + DRIFT**2 * _unlearned(plant, bias).variance)
 
 
-def _summed_up(reference: Reference, plant: Plant, sampled: Sampled, runs: tuple) -> Simulation:
+def _summed_up(reference: Reference, plant: Plant, size: float, sampled: Sampled, runs: tuple) -> Simulation:
     records, is_closed = runs
     time = plant.period * np.arange(sampled.legs.shape[0])
     off_position, off_rotation = _errors(records.pose, sampled.late)
@@ -306,7 +308,9 @@ def _summed_up(reference: Reference, plant: Plant, sampled: Sampled, runs: tuple
     is_finite = jnp.all(jnp.isfinite(off_position), axis=1)
     settling = jnp.full(is_finite.shape, jnp.nan)
     if reference.settled_after == 0:
-        settling = _settling_time(time, off_position, off_rotation)
+        # position and length() times rotation together
+        off = np.hypot(np.asarray(off_position), size * np.asarray(off_rotation))
+        settling = jnp.asarray(_settling_time(time, off))
     return Simulation(
         time=jnp.asarray(time),
         desired=sampled.late,
@@ -331,10 +335,8 @@ def _errors(pose: SE3, desired: SE3) -> tuple[jax.Array, jax.Array]:
     return safe.norm(pose.translation - desired.translation), 2 * half
 
 
-def _settling_time(time: np.ndarray, *errors: jax.Array) -> jax.Array:
-    """From when on all errors stay within 2 % of what they were at first; NaN: never. -> (seeds,)"""
-    is_off = np.zeros(errors[0].shape, bool)
-    for error in map(np.asarray, errors):
-        is_off |= ~(error <= SETTLED * error[:, :1] + 1e-12)
-    next_ = np.where(is_off, np.arange(time.size), -1).max(axis=1) + 1
-    return jnp.asarray(np.where(next_ < time.size, time[np.minimum(next_, time.size - 1)], np.nan))
+def _settling_time(time: np.ndarray, off: np.ndarray) -> np.ndarray:
+    """From when on errors (seeds, n) stay within 2 % of what they were at first; NaN: never. -> (seeds,)"""
+    is_off = ~(off <= SETTLED * off[:, :1])
+    after = np.where(is_off, np.arange(time.size), -1).max(axis=1) + 1
+    return np.where(after < time.size, time[np.minimum(after, time.size - 1)], np.nan)

@@ -27,6 +27,9 @@ from pk_jax.geometry.se3 import SE3
 from pk_jax.kinematics.batching import home_shapes
 from pk_jax.kinematics.forward import forward_kinematics
 from pk_jax.kinematics.inverse import inverse_kinematics
+from pk_jax.kinematics.linear_stage import ROWS
+from pk_jax.kinematics.nine_lengths import nine_length_pose, require_nine_rows
+from pk_jax.mechanisms.stewart import LEGS
 from pk_jax.status import Status
 
 Solve = Callable[[Layout, np.ndarray], tuple[list[Any], np.ndarray]]  # -> columns to write, statuses
@@ -43,6 +46,34 @@ def forward_rows(named: Named, source: str, target: str | None, **options: Any) 
     header += ["status", "residual", "steps", "sigma_min", "det_sign"]
     solve = partial(_forward, named, _Padding())
     return _stream(named, source, target, joint_layouts(named), header, solve, **options)
+
+
+def nine_length_rows(
+    named: Named, source: str, target: str | None, *, sigma: str | None = None, **options: Any
+) -> Counter[str]:
+    """Poses of nine lengths by the closed form and the weighted estimate; see `_stream`.
+
+    sigma:  standard deviations of a leg's length and a sensor's, in the unit of the user; default: equal.
+            Where they are given, so are those of the pose
+    """
+    weights = _weights_of(named, sigma)
+    header = [c.name for c in output_layout(named)]
+    header += ["status", "residual", "steps", "sigma_min", "z_squared"]
+    if weights is not None:
+        header += [f"sd_{name}" for name in ("x", "y", "z", "rx", "ry", "rz")]
+    solve = partial(_nine_lengths, named, _Padding(), weights)
+    return _stream(named, source, target, joint_layouts(named), header, solve, **options)
+
+
+def _weights_of(named: Named, sigma: str | None) -> np.ndarray | None:
+    require_nine_rows("--closed-form", named.mechanism)
+    if sigma is None:
+        return None
+    fields = sigma.split(",")
+    found = [float(field) * named.metres if is_number(field) else np.nan for field in fields]
+    if len(found) != 2 or not all(np.isfinite(each) and each > 0 for each in found):
+        raise ValueError(f"--sigma must be two positive numbers, of a leg and of a sensor, got {sigma!r}")
+    return np.repeat(1 / np.square(found), [LEGS, ROWS - LEGS])
 
 
 def inverse_rows(
@@ -223,6 +254,29 @@ def _forward(named: Named, pad: _Padding, layout: Layout, rows: np.ndarray) -> t
     status, residual, steps, sigma, signs = (np.asarray(each) for each in found[1:6])
     signs = [f"{sign:.0f}" for sign in signs.tolist()]
     return [*numbers, _names(status), residual, steps, sigma, signs], status
+
+
+def _nine_lengths(
+    named: Named, pad: _Padding, weights: np.ndarray | None, layout: Layout, rows: np.ndarray
+) -> tuple[list[Any], np.ndarray]:
+    found = nine_length_pose(named.mechanism, rows * scale_of(named, layout), weights)
+    poses = jax.tree.map(lambda leaf: pad(np.asarray(leaf)), found.pose)
+    numbers = [column[: len(rows)] for column in pose_columns(named, poses)]
+    status, residual, steps, sigma, squared = map(
+        np.asarray, (found.status, found.residual, found.steps, found.sigma_min, found.z_squared)
+    )
+    columns = [
+        *numbers,
+        _names(status),
+        residual / named.metres,
+        steps,
+        sigma,
+        squared / named.metres**2,
+    ]
+    if weights is not None:
+        spread = np.sqrt(np.diagonal(np.asarray(found.covariance), axis1=1, axis2=2))
+        columns += [*(spread / np.repeat([named.metres, 1.0], 3)).T]
+    return columns, status
 
 
 def _inverse(

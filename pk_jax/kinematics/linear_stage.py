@@ -64,7 +64,7 @@ class Stage(NamedTuple):
 def rank_of(stage: Stage) -> jax.Array:
     """How many of the six linear equations are independent. -> () int"""
     values = stage.singular_values
-    return jnp.sum(values > SINGULAR_BELOW * values[0])
+    return (values > SINGULAR_BELOW * values[0]).sum()
 
 
 def condition_of(stage: Stage) -> jax.Array:

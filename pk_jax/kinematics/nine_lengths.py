@@ -96,7 +96,7 @@ def nine_length_pose(
         checks.is_positive("weights", weights)
     if checks.is_concrete(stewart):
         method = method_for("nine_length_pose", stewart, method)
-    stage = known_stage(stewart) if checks.is_concrete(stewart) else None
+    stage = known(stewart).stage if checks.is_concrete(stewart) else None
     if is_known and method in ON_LANES:
         rows = np.broadcast_arrays(np.atleast_2d(lengths), weights)
         found = _known_rows(stewart, stage, *rows, method)
@@ -130,7 +130,7 @@ def nine_length_candidates(
         raise ValueError("method 'products' offers no candidates to choose from; take 'macaulay'")
     found = method_for("nine_length_candidates", stewart, method)
     method = "quintic" if method is None and found != "linear" else found
-    return _candidates(stewart, known_stage(stewart), lengths, many, method)
+    return _candidates(stewart, known(stewart).stage, lengths, many, method)
 
 
 @partial(jax.jit, static_argnums=(3, 4))
@@ -145,16 +145,32 @@ def _candidates(stewart, stage, lengths, many, method):
     return over_rows(one, (lengths,), (many,))
 
 
-def known_stage(stewart: Stewart) -> Stage:
-    """The linear stage of a known geometry, computed once."""
-    found = _stages.get(stewart)
+class Known(NamedTuple):
+    """What is found out once of a known geometry."""
+
+    stage: Stage
+    refusal: str | None  # why the closed form cannot work
+    method: str  # that suits the layout
+    rank: int
+    condition: float
+
+
+def known(stewart: Stewart) -> Known:
+    """The linear stage of a known geometry and what it is worth, computed once."""
+    found = _known.get(stewart)
     if found is None:
         with checks.known_values():
-            found = _stages[stewart] = jax.jit(stage_of)(stewart)
+            stage = jax.tree.map(jnp.asarray, _stage(stewart))
+        given = jax.tree.map(np.asarray, stage)
+        general = "products" if given.squares_condition < PRODUCTS_UP_TO else "macaulay"
+        method = "linear" if given.is_planar else general
+        rank, condition = int(rank_of(given)), float(condition_of(given))
+        found = _known[stewart] = Known(stage, refusal(given), method, rank, condition)
     return found
 
 
-_stages: WeakKeyDictionary[Stewart, Stage] = WeakKeyDictionary()
+_known: WeakKeyDictionary[Stewart, Known] = WeakKeyDictionary()
+_stage = jax.jit(stage_of)
 
 
 def require_nine_rows(function: str, stewart: Any) -> None:
@@ -169,33 +185,29 @@ def require_nine_rows(function: str, stewart: Any) -> None:
 
 def method_for(function: str, stewart: Stewart, method: str | None) -> str:
     """The method that is asked for, or that suits the layout. ValueError where none can work."""
-    stage = known_stage(stewart)
-    if (reason := refusal(stage)) is not None:
-        raise ValueError(f"{function}: {reason}")
-    if bool(stage.is_planar):
-        if method not in (None, "linear"):
-            raise ValueError(
-                f"method {method!r} is for bases that are not planar: the pose and its mirror image are both "
-                "roots of this one; use 'linear'"
-            )
-        return "linear"
-    if method == "linear":
+    suited = known(stewart)
+    if suited.refusal is not None:
+        raise ValueError(f"{function}: {suited.refusal}")
+    if suited.method == "linear" and method not in (None, "linear"):
+        raise ValueError(
+            f"method {method!r} is for bases that are not planar: of this one the pose and its mirror image "
+            "are both roots; use 'linear'"
+        )
+    if suited.method != "linear" and method == "linear":
         raise ValueError("method 'linear' is for planar bases, all A_i and S_j in one plane")
-    return method or ("products" if stage.squares_condition < PRODUCTS_UP_TO else "macaulay")
+    return method or suited.method
 
 
-def refusal(stage: Stage) -> str | None:
-    """Why the closed form cannot work for a layout; None where it can."""
+def refusal(stage: Any) -> str | None:
+    """Why the closed form cannot work for a layout, a `Stage` of NumPy arrays; None where it can."""
     frame = stage.frame
-    if not float(frame.slimness) > 1e-6:
+    if not frame.slimness > 1e-6:
         return "the sensors' platform joints T1, T2, T3 (Stewart.platform[6:9]) must not lie on one line"
-    size = float(jnp.sqrt(jnp.mean(frame.sides)))
-    off = np.asarray(frame.off)
-    if off.max() > IN_PLANE_TO * size:
-        worst = int(off.argmax())
+    if frame.off.max() > IN_PLANE_TO * np.sqrt(np.mean(frame.sides)):
+        worst = int(frame.off.argmax())
         return (
             f"all platform joints must lie in the plane of T1, T2, T3, but Stewart.platform[{worst}] is "
-            f"{off[worst]:.6g} off it (forward_kinematics solves nine rows of any layout from a guess)"
+            f"{frame.off[worst]:.6g} off it (forward_kinematics solves nine rows of any layout from a guess)"
         )
     if (rank := int(rank_of(stage))) < LEGS:
         return (
@@ -317,7 +329,7 @@ def _known_rows(
         again = _persist_rows(stewart, stage, *taken)
         for whole, part in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
             whole[these] = np.asarray(part)[: len(these)]
-    return _answer(stage, found)
+    return _answer(stewart, found)
 
 
 def _lane_values(mech: tuple, lengths: Entries, weights: Entries, *, method: str) -> list[Lane]:
@@ -350,7 +362,7 @@ def _persist_rows(stewart, stage, lengths, weights, found):
     return jax.vmap(partial(_persist, stewart, stage))(lengths, weights, found)
 
 
-def _answer(stage: Stage, found: Found) -> NineLengthPose:
+def _answer(stewart: Stewart, found: Found) -> NineLengthPose:
     """Many rows of NumPy arrays."""
     is_bad = found.status == Status.BAD_INPUT
     candidate, start, covariance, squared, residual, sigma = blanked(
@@ -362,8 +374,8 @@ def _answer(stage: Stage, found: Found) -> NineLengthPose:
             pose=blanked(found.pose, found.status != Status.OK),
             status=found.status,
             closed_form=start,
-            rank=np.full(is_bad.shape, rank_of(stage)),
-            condition=np.full(is_bad.shape, condition_of(stage)),
+            rank=np.full(is_bad.shape, known(stewart).rank),
+            condition=np.full(is_bad.shape, known(stewart).condition),
             z_squared=squared,
             residual=residual,
             steps=np.where(is_bad, 0, found.steps),

@@ -18,6 +18,7 @@ from pk_jax.mechanisms.two_rpr import TwoRPR
 
 _NAM = "Nam, Lee and Park 2006, Trans. KSME A 30(11)"
 _EXAMPLE = "example geometry (the paper prints none) of the screw paper's"
+_PATENT = "example geometry (the patent prints none) of Ryu et al., KR 10-2000-0073215"
 
 _INCH, _MM = 0.0254, 1e-3
 
@@ -53,6 +54,22 @@ def _linuxcnc() -> Stewart:
         [-10.459, -4.884, 0],
     ]
     return Stewart(base=_INCH * corners[[0, 1, 1, 2, 2, 0]], platform=_INCH * np.array(platform))
+
+
+def _nine_lengths(heights: float) -> Stewart:
+    """The semi-regular platform with three sensors, its base joints `heights` above and below in turn."""
+    circle = lambda radius, degrees: (
+        radius
+        * np.stack([np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees)), np.zeros(len(degrees))], axis=1)
+    )
+    legs = circle(1.0, [42, 138, 162, 258, 282, 18])
+    legs[:, 2] = heights * np.array([1, -1, 1, -1, 1, -1])
+    corners = circle(1 / np.sqrt(3), [90, 210, 330])
+    near, far = [0, 0, 1, 1, 2, 2], [2, 1, 0, 2, 1, 0]
+    joints = 0.85 * corners[near] + 0.15 * corners[far]
+    return Stewart(
+        base=np.concatenate([legs, circle(0.6, [150, 270, 30])]), platform=np.concatenate([joints, corners])
+    )
 
 
 def _calibration_nominal() -> Stewart:
@@ -105,6 +122,14 @@ CATALOGUE: dict[str, Entry] = {
     "wide-semi-regular-stewart": Entry(
         lambda: Stewart.semi_regular(1.0, 0.7, np.deg2rad(20.0), np.deg2rad(15.0)),
         "joints in pairs, 20 and 15 degrees off their middles, on circles of radius 1 and 0.7",
+    ),
+    "nine-lengths": Entry(
+        lambda: _nine_lengths(0.0),
+        f"{_PATENT}, embodiment 2 (planar base); six legs, three sensors",
+    ),
+    "nine-lengths-general": Entry(
+        lambda: _nine_lengths(0.15),
+        f"{_PATENT}, embodiment 1 (base joints anywhere); six legs, three sensors",
     ),
     "hexapod-log": Entry(
         _hexapod_log,

@@ -70,11 +70,7 @@ def jacobians_at(named: Named, text: str | None, free: str | None = None) -> Jac
 
 def as_json(found: dict[str, Any]) -> str:
     """Strict JSON; what is not finite is null."""
-    plain = {
-        name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in found.items()
-    }
-    finite = lambda value: [finite(v) for v in value] if isinstance(value, list) else _finite(value)
-    return json.dumps({name: finite(value) for name, value in plain.items()}, indent=2, allow_nan=False)
+    return json.dumps(_finite(found), indent=2, allow_nan=False)
 
 
 def as_text(found: Jacobians) -> str:
@@ -140,4 +136,8 @@ def _row(row: np.ndarray) -> str:
 
 
 def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(each) for name, each in value.items()}
+    if isinstance(value, np.ndarray | list):
+        return [_finite(each) for each in (value.tolist() if isinstance(value, np.ndarray) else value)]
     return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from pk_jax import checks
 from pk_jax.control.loop import FEEDBACKS, Simulation, simulate_control
 from pk_jax.control.plant import Gains, Plant, check_gains, check_plant
 from pk_jax.control.reference import Reference, circle_reference, step_reference
@@ -91,6 +92,7 @@ def runs_of(
     one: Experiment, feedbacks: Sequence[str], seeds: int, seed: int, note: Callable[[str], None]
 ) -> dict[str, Simulation]:
     """Every feedback on the same machines."""
+    seeds = checks.is_count("seeds", seeds, most=100_000)
     found = {}
     for feedback in feedbacks:
         note(f"simulating feedback {feedback}")

@@ -102,7 +102,7 @@ def exact_lengths(embodiment: int, geometries: int, poses: int, say: Say) -> Exa
     errors, closed = [], []
     for done in range(1, geometries + 1):
         mech, true = random_layout(rng, embodiment), random_poses(rng, poses)
-        found = nine_length_pose(mech, _lengths(mech, true))
+        found = nine_length_pose(mech, lengths_of(mech, true))
         errors.append(pose_errors(found.pose, true))
         closed.append(pose_errors(found.closed_form, true))
         say(f"exact lengths, embodiment {embodiment}", done, geometries)
@@ -131,7 +131,7 @@ def noisy_lengths(embodiment: int, layouts: int, seeds: int, say: Say) -> Iterat
         for done, mech in enumerate(machines, 1):
             true = random_poses(rng, seeds)
             error = rng.standard_normal((seeds, 9))
-            found = nine_length_pose(mech, _lengths(mech, true) + noise * error)
+            found = nine_length_pose(mech, lengths_of(mech, true) + noise * error)
             spread = noise * np.sqrt(np.diagonal(np.asarray(found.covariance), axis1=1, axis2=2))
             gross += int(np.sum(~(pose_errors(found.pose, true) <= GROSS * spread.max(axis=1))))
             not_ok += int(np.sum(np.asarray(found.status) != Status.OK))
@@ -143,7 +143,8 @@ def noisy_lengths(embodiment: int, layouts: int, seeds: int, say: Say) -> Iterat
         yield Noisy(embodiment, noise, layouts * seeds, not_ok, gross, *medians)
 
 
-def _lengths(mech: Stewart, poses: SE3) -> np.ndarray:
+def lengths_of(mech: Stewart, poses: SE3) -> np.ndarray:
+    """Of all rows at a batch of poses. -> (n, k)"""
     points = np.einsum("nij,kj->nki", poses.rotation, mech.platform) + np.asarray(poses.translation)[:, None]
     return np.linalg.norm(points - np.asarray(mech.base), axis=-1)
 
@@ -220,7 +221,7 @@ def circle_runs(seeds: int, say: Say) -> dict[str, dict[str, Simulation]]:
 def step_runs(seeds: int) -> dict[str, Simulation]:
     """The step, with noise, by every feedback."""
     mech = catalogued("nine-lengths")
-    reference = step_reference(mech, STEP)
+    reference = step_reference(mech, STEP, duration=3.0)  # as many samples as the circle: one program
     return {
         feedback: simulate_control(mech, reference, feedback, key=jax.random.key(1), seeds=seeds)
         for feedback in FEEDBACKS

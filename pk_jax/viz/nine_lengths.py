@@ -59,22 +59,24 @@ def draw_platform(mech: Stewart, pose: Any, joints: Any, ax: Axes | None = None)
     ax.plot(*base[LEGS:].T, "s", color=VERMILION, markersize=5)
     ax.plot(*corners.T, "o", color=VERMILION, markersize=4.5)
     size = float(np.ptp(points, axis=0).max())
-    for name, places, away, rise in (
-        ("A", base[:LEGS], 0.09, 0.0),
-        ("S", base[LEGS:], -0.07, -0.02),
-        ("B", platform[:LEGS], -0.10, -0.02),
-        ("T", corners, 0.10, 0.04),
-    ):
-        middle = places.mean(axis=0)
+    for name, places, away in (("A", base[:LEGS], 0.09), ("S", base[LEGS:], -0.07), ("T", corners, 0.1)):
         for i, at in enumerate(places, 1):
-            apart = np.linalg.norm(at - middle)
-            way = (at - middle) / apart if apart > 0 else np.zeros(3)
-            at = at + size * (away * way + [0, 0, rise])
-            color = VERMILION if name in "ST" else INK
-            ax.text(*at, f"${name}_{i}$", color=color, ha="center", va="center", fontsize=9)
+            _name_joint(ax, f"${name}_{i}$", at, places.mean(axis=0), away * size)
+    for i, at in enumerate(platform[:LEGS]):
+        others = np.delete(platform[:LEGS], i, axis=0)
+        partner = others[np.argmin(np.linalg.norm(others - at, axis=1))]
+        _name_joint(ax, f"$B_{i + 1}$", at, partner, 0.07 * size)
     ax.set_box_aspect(None, zoom=0.9)
     ax.view_init(elev=30, azim=-75)
     return ax
+
+
+def _name_joint(ax: Axes, name: str, at: np.ndarray, other: np.ndarray, away: float) -> None:
+    """A name beside a joint, on the line to another point."""
+    apart = np.linalg.norm(at - other)
+    place = at + away * (at - other) / apart if apart > 0 else at
+    color = VERMILION if name[1] in "ST" else INK
+    ax.text(*place, name, color=color, ha="center", va="center", fontsize=9)
 
 
 def platform_plan(mech: Stewart, ax: Axes | None = None) -> Axes:

@@ -2,9 +2,11 @@
 
 import os
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 import pk_jax as pk
+from pk_jax.cli import main
 
 pk.enable_x64()
 
@@ -16,3 +18,20 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("house")
+
+
+@pytest.fixture
+def run(capsys, monkeypatch):
+    """The command line in this process: exit code, stdout, stderr."""
+    monkeypatch.setattr("pk_jax.cli._compile_cache", lambda: None)
+
+    def run(*arguments):
+        try:
+            code = main([str(each) for each in arguments])
+        except SystemExit as stop:  # argparse
+            code = stop.code
+        shown = capsys.readouterr()
+        assert "Traceback" not in shown.err
+        return code, shown.out, shown.err
+
+    return run

@@ -11,7 +11,6 @@ from outsiders import three_rpr
 from refusals import said_by
 
 import pk_jax as pk
-from pk_jax.cli import main
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 LOG = str(EXAMPLES / "hexapod_log.csv")
@@ -303,22 +302,6 @@ def test_a_real_log_alone_gives_the_geometry(run, tmp_path):
 
 
 # The command line
-
-
-@pytest.fixture
-def run(capsys, monkeypatch):
-    monkeypatch.setattr("pk_jax.cli._compile_cache", lambda: None)
-
-    def run(*arguments):
-        try:
-            code = main(list(arguments))
-        except SystemExit as stop:  # argparse
-            code = stop.code
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.err
-        return code, shown.out, shown.err
-
-    return run
 
 
 def csv(header, *columns):

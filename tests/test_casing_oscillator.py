@@ -16,7 +16,6 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import pk_jax as pk
-from pk_jax.cli import main
 from pk_jax.files.mechanism_file import load_mechanism, save_mechanism
 from pk_jax.kinematics.jacobian import self_motions
 
@@ -942,20 +941,9 @@ def test_what_is_saved_is_loaded(tmp_path, unit):
 
 
 @pytest.fixture
-def run(capsys, tmp_path, monkeypatch):
-    """The command line in this process, in an empty folder."""
-    monkeypatch.setattr("pk_jax.cli._compile_cache", lambda: None)
+def run(run, tmp_path, monkeypatch):
+    """The command line in an empty folder."""
     monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        try:
-            code = main(list(arguments))
-        except SystemExit as stop:  # argparse
-            code = stop.code
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.err
-        return code, shown.out, shown.err
-
     return run
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import pk_jax as pk
-from pk_jax.cli import main
 from pk_jax.files.named import named_mechanism
 from pk_jax.files.simulated import Plant, set_by
 from pk_jax.papers import nine_lengths as paper
@@ -20,20 +19,6 @@ NINE = "nine-lengths"
 def _own_cache(monkeypatch, tmp_path):
     monkeypatch.setattr("pk_jax.cli._compile_cache", lambda: None)
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture
-def run(capsys):
-    def run(*arguments):
-        try:
-            code = main([str(each) for each in arguments])
-        except SystemExit as stop:  # argparse
-            code = stop.code
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.err
-        return code, shown.out, shown.err
-
-    return run
 
 
 def columns(text):

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import pk_jax as pk
-from pk_jax.cli import main
 
 HEXAPOD = str(Path(__file__).parent.parent / "examples" / "hexapod.toml")
 ROW = "169.252,169.355,169.785,168.888,168.418,169.185"  # of the log that hexapod.toml was identified from
@@ -32,20 +31,6 @@ def here(tmp_path, monkeypatch):
     folder.mkdir()
     monkeypatch.chdir(folder)
     return folder
-
-
-@pytest.fixture
-def run(capsys):
-    def run(*arguments):
-        try:
-            code = main(list(arguments))
-        except SystemExit as stop:  # argparse
-            code = stop.code
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.err
-        return code, shown.out, shown.err
-
-    return run
 
 
 def table(text):

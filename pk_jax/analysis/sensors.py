@@ -14,8 +14,9 @@ from pk_jax.geometry.poses import difference
 from pk_jax.geometry.se3 import SE3
 from pk_jax.kinematics.batching import home_shapes, over_rows, rows_of
 from pk_jax.kinematics.closed_form import closed_form
+from pk_jax.kinematics.length_errors import LengthErrors
 from pk_jax.kinematics.linear_stage import Stage, stage_of
-from pk_jax.kinematics.nine_lengths import LengthErrors, known, require_nine_rows
+from pk_jax.kinematics.nine_lengths import known, require_nine_rows
 from pk_jax.mechanisms.stewart import LEGS, Stewart
 
 

@@ -27,8 +27,9 @@ from pk_jax.geometry import safe
 from pk_jax.geometry.poses import difference, retract
 from pk_jax.geometry.se3 import SE3
 from pk_jax.kinematics.closed_form import closed_form
+from pk_jax.kinematics.length_errors import LengthErrors
 from pk_jax.kinematics.linear_stage import ROWS
-from pk_jax.kinematics.nine_lengths import LengthErrors, known, method_for, require_nine_rows
+from pk_jax.kinematics.nine_lengths import known, method_for, require_nine_rows
 from pk_jax.mechanisms.stewart import LEGS, Stewart
 from pk_jax.status import Status
 

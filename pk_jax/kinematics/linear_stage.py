@@ -12,7 +12,7 @@ for any triangle). Their matrix knows no pose: whether a layout of sensors can d
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ ROWS = LEGS + 3
 IN_PLANE_TO = 1e-6  # of the platform's size: what joints may be off the plane of T1, T2, T3
 PLANAR_TO = 1e-9  # of the base's size: what joints of a planar base may be off its plane
 SINGULAR_BELOW = 1e-9  # least over greatest singular value of a stage that is of no use
+ROUNDOFFS = 64  # what coordinates are off in any case: counts where floats are short
 PAIRS = ((0, 1), (1, 2), (2, 0))  # the sides of the triangle
 
 
@@ -61,10 +62,15 @@ class Stage(NamedTuple):
     is_planar: jax.Array  # () bool: all A_i and S_j in one plane (embodiment 2)
 
 
+def at_least(tolerance: float, dtype: Any) -> float:
+    """A tolerance, or what roundoff needs."""
+    return max(tolerance, ROUNDOFFS * float(jnp.finfo(dtype).eps))
+
+
 def rank_of(stage: Stage) -> jax.Array:
     """How many of the six linear equations are independent. -> () int"""
     values = stage.singular_values
-    return (values > SINGULAR_BELOW * values[0]).sum()
+    return (values > at_least(SINGULAR_BELOW, values.dtype) * values[0]).sum()
 
 
 def condition_of(stage: Stage) -> jax.Array:
@@ -103,13 +109,13 @@ def stage_of(stewart: Stewart) -> Stage:
     middle = jnp.mean(base, axis=0)
     size = jnp.linalg.norm(base - middle)
     extent, axes = jnp.linalg.svd(lax.stop_gradient(base - middle))[1:]
-    is_planar = extent[2] <= PLANAR_TO * extent[0]
+    is_planar = extent[2] <= at_least(PLANAR_TO, base.dtype) * extent[0]
     home = lax.stop_gradient(stewart.home()[0])
     up = axes[2] * jnp.sign(axes[2] @ (home.translation + home.rotation @ frame.centre - middle))
 
     values, directions = jnp.linalg.svd(lax.stop_gradient(matrix))[1:]
     straight_up = jnp.kron(jnp.eye(3, dtype=base.dtype), up[:, None])  # (9, 3)
-    inverse = jnp.linalg.pinv(matrix, rtol=SINGULAR_BELOW)
+    inverse = jnp.linalg.pinv(matrix, rtol=at_least(SINGULAR_BELOW, base.dtype))
     free = jnp.where(is_planar, straight_up, directions[LEGS:].T)
     free = free - inverse @ (matrix @ free)  # zero, with the right derivative
 

@@ -7,7 +7,6 @@ only the start of a Gauss-Newton iteration on all nine lengths, weighted.
 
 from __future__ import annotations
 
-import dataclasses
 from functools import partial, reduce
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -27,8 +26,9 @@ from pk_jax.kinematics.closure import pose_scale
 from pk_jax.kinematics.entrywise import entrywise
 from pk_jax.kinematics.forward import blanked
 from pk_jax.kinematics.lane_map import lane_map
-from pk_jax.kinematics.lanes import Entries, Lane, items_of, times, total
-from pk_jax.kinematics.linear_stage import IN_PLANE_TO, ROWS, Stage, condition_of, rank_of, stage_of
+from pk_jax.kinematics.lanes import Entries, Lane, items_of
+from pk_jax.kinematics.length_errors import Judged, LengthErrors, judge, judge_on_lanes
+from pk_jax.kinematics.linear_stage import IN_PLANE_TO, ROWS, Stage, at_least, condition_of, rank_of, stage_of
 from pk_jax.mechanisms.stewart import LEGS, Stewart
 from pk_jax.status import Status
 
@@ -203,7 +203,7 @@ def refusal(stage: Any) -> str | None:
     frame = stage.frame
     if not frame.slimness > 1e-6:
         return "the sensors' platform joints T1, T2, T3 (Stewart.platform[6:9]) must not lie on one line"
-    if frame.off.max() > IN_PLANE_TO * np.sqrt(np.mean(frame.sides)):
+    if frame.off.max() > at_least(IN_PLANE_TO, frame.off.dtype) * np.sqrt(np.mean(frame.sides)):
         worst = int(frame.off.argmax())
         return (
             f"all platform joints must lie in the plane of T1, T2, T3, but Stewart.platform[{worst}] is "
@@ -215,69 +215,6 @@ def refusal(stage: Any) -> str | None:
             "(see sensor_layout)"
         )
     return None
-
-
-# --- the estimate: nine lengths, weighted; on lanes, or of scalars that `vmap` makes lanes
-
-
-class LengthErrors(Stewart):
-    """Errors of the nine lengths, each over its standard deviation, as a mechanism's residual."""
-
-    roots: jax.Array  # (k,) of the weights
-
-    @classmethod
-    def of(cls, stewart: Stewart, roots: Any) -> LengthErrors:
-        """Without another look at a platform that is good; leaves may be `Entries`."""
-        made = object.__new__(cls)
-        for field in dataclasses.fields(stewart):
-            object.__setattr__(made, field.name, getattr(stewart, field.name))
-        object.__setattr__(made, "roots", roots)
-        return made
-
-    def residual(self, pose: SE3, joints: jax.Array) -> jax.Array:
-        return self.roots * (self.inverse(pose) - joints)
-
-    def linearize(self, pose: SE3, joints: jax.Array) -> tuple[jax.Array, jax.Array]:
-        rows, legs = super().linearize(pose, joints)[1], self.inverse(pose)
-        return self.roots * (legs - joints), (self.roots / legs)[:, None] * rows
-
-
-class Judged(NamedTuple):
-    """What an estimate is worth."""
-
-    residual: Any  # weighted RMS error
-    share: Any  # of the mean length
-    sigma_min: Any
-    covariance: Any  # (6, 6)
-
-
-def judge(errors: LengthErrors, pose: SE3, lengths: jax.Array) -> Judged:
-    """The nine errors evaluated afresh at `pose`."""
-    value, jacobian, weight, size = _judged_by(errors, pose, lengths)
-    covariance = jnp.linalg.inv(jacobian.T @ jacobian)
-    return _worth(jnp.sum(value**2), jnp.diagonal(covariance), weight, size, jnp.sum(lengths), covariance)
-
-
-def judge_on_lanes(errors: Any, pose: Any, lengths: Entries) -> Judged:
-    """The same, everything made of `Entries`."""
-    value, jacobian, weight, size = entrywise(_judged_by, errors, pose, lengths)
-    factors = elimination.factor_symmetric(elimination.normal(jacobian.rows()))
-    rows = elimination.inverse_symmetric(factors)
-    variances = [rows[i][i] for i in range(6)]
-    squares = total([times(f, f) for f in value.items])
-    covariance = Entries((6, 6), [item for row in rows for item in row])
-    return _worth(squares, variances, weight.items[0], size.items[0], total(lengths.items), covariance)
-
-
-def _judged_by(errors: LengthErrors, pose: SE3, lengths: jax.Array) -> tuple:
-    return *errors.linearize(pose, lengths), jnp.sum(errors.roots**2), errors.length()
-
-
-def _worth(squares: Any, variances: Any, weight: Any, size: Any, lengths: Any, covariance: Any) -> Judged:
-    residual = jnp.sqrt(squares / weight)
-    spread = sum(variances[:3]) + size * size * sum(variances[3:])
-    sigma = jnp.sqrt(ROWS / (weight * spread))
-    return Judged(residual, ROWS * residual / lengths, jnp.where(jnp.isfinite(sigma), sigma, 0), covariance)
 
 
 def _verdict(judged: Judged, is_stationary: Any) -> Any:

@@ -84,7 +84,14 @@ def test_it_refuses_what_has_no_nine_lengths(run, tmp_path):
         assert len(err.splitlines()) == 1
 
 
-def test_sensors_are_judged_and_placed(run, tmp_path):
+def test_sensors_are_judged(run):
+    code, out, _ = run("sensors", NINE, "--unit", "mm")
+    assert code == 0 and "planar base, linear stage of rank 6 of 6, condition 4.101" in out
+    assert "rotation (rad/mm): median" in out
+
+
+@pytest.mark.soak
+def test_sensors_are_placed(run, tmp_path):
     code, out, _ = run("sensors", NINE, "--place", "1", "--starts", "2", "-o", "placed.toml")
     assert code == 0 and "planar base, linear stage of rank 6 of 6" in out and "status OK" in out
     placed, before = pk.load_mechanism("placed.toml"), pk.catalogued(NINE)
@@ -146,12 +153,14 @@ def test_the_figures_of_the_patent_show_every_joint(tmp_path):
     assert {"$X_d$", "$E$", "$A$", "$L$", "$X_a$"} <= loop
 
 
+@pytest.mark.soak
 def test_exact_lengths_of_random_layouts_give_their_poses():
     for embodiment in paper.EMBODIMENTS:
         found = paper.exact_lengths(embodiment, 3, 5, lambda *_: None)
         assert found.right == found.poses == 15 and found.worst < 1e-12
 
 
+@pytest.mark.soak
 def test_the_noise_table_counts_and_draws():
     rows = list(paper.noisy_lengths(2, 1, 20, lambda *_: None))
     assert [row.noise for row in rows] == list(paper.NOISES)

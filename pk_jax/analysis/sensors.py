@@ -15,7 +15,7 @@ from pk_jax.geometry.se3 import SE3
 from pk_jax.kinematics.batching import home_shapes, over_rows, rows_of
 from pk_jax.kinematics.closed_form import closed_form
 from pk_jax.kinematics.length_errors import LengthErrors
-from pk_jax.kinematics.linear_stage import Stage, stage_of
+from pk_jax.kinematics.linear_stage import IN_PLANE_TO, Stage, at_least, rank_of, stage_of
 from pk_jax.kinematics.nine_lengths import known, require_nine_rows
 from pk_jax.mechanisms.stewart import LEGS, Stewart
 
@@ -74,7 +74,7 @@ class NoiseGains(NamedTuple):
     """What reaches the pose of independent errors of the lengths; batch first."""
 
     estimate: NoiseGain  # weighted least squares of all nine
-    closed_form: NoiseGain  # alone
+    closed_form: NoiseGain  # alone; NaN where the layout makes it impossible
     legs: NoiseGain  # six legs, no sensors
 
 
@@ -137,4 +137,7 @@ def _of_closed_form(stewart: Stewart, stage: Stage, pose: SE3, weights: jax.Arra
     at = stewart.inverse(pose)
     moved = lambda lengths: difference(pose, closed_form(stage, lengths, None)[0])
     jacobian = jax.jacfwd(moved)(at)
-    return jacobian / weights @ jacobian.T
+    size = jnp.sqrt(jnp.mean(stage.frame.sides))
+    is_flat = jnp.max(stage.frame.off) <= at_least(IN_PLANE_TO, at.dtype) * size
+    is_possible = is_flat & (rank_of(stage) == LEGS)
+    return jnp.where(is_possible, jacobian / weights @ jacobian.T, jnp.nan)

@@ -16,11 +16,12 @@ from pk_jax.control.plant import (
     Plant,
     check_gains,
     check_plant,
+    checked_key,
     drawn,
     driven,
     read,
-    variances_of,
     weights_of,
+    white_variances,
 )
 from pk_jax.control.reference import Reference
 from pk_jax.geometry import safe
@@ -34,9 +35,12 @@ from pk_jax.mechanisms.stewart import LEGS, Stewart
 from pk_jax.status import Status
 
 FEEDBACKS = ("joint", "legs", "closed", "nine", "learned")
+MEASURED = FEEDBACKS[2:]  # by all nine lengths
 NEWTON_STEPS = 3  # a sample, from the last one's pose
-DRIFT = 1e-3  # of their spread: what constant errors may wander in a sample
+DRIFT = 0.03  # of their spread: what constant errors may wander in a second, as the root of time
 SETTLED = 0.02  # of the step
+STAYS_FOR = 0.05  # of the run: the least time for which it must stay settled
+CLEAR_ABOVE = 1e-2  # least singular value of the legs, without units, below which a run is lost
 CLOSED_TO = 1e-9  # of length(): what the true machine's loops may be open
 
 
@@ -53,10 +57,8 @@ class Simulation(NamedTuple):
     rotation_error: jax.Array  # (seeds, n) rad
     rms_position: jax.Array  # (seeds,) over the samples that count
     rms_rotation: jax.Array  # (seeds,) rad
-    settling_time: (
-        jax.Array
-    )  # (seeds,) s until the error stays within 2 % of the step; NaN: never, or no step
-    status: jax.Array  # (seeds,) Status: OK, or STALLED where the platform's loops would not close
+    settling_time: jax.Array  # (seeds,) s until it stays within 2 % of the step; NaN: never, no step
+    status: jax.Array  # (seeds,) Status
 
 
 def simulate_control(
@@ -76,17 +78,22 @@ def simulate_control(
     reference:  `circle_reference(...)` or `step_reference(...)`
     feedback:   "joint": leg lengths alone; "legs": forward kinematics of six legs, Newton from the last
                 sample; "closed": the closed form of nine lengths; "nine": weighted least squares of
-                nine; "learned": the same, while a Kalman filter learns the constant errors of the encoders
-                from how the nine lengths contradict one another along the way
+                nine; "learned": the same, while a Kalman filter learns the constant errors of all nine
+                encoders from how the lengths contradict one another along the way; it trusts the
+                geometry of the sensors, and where that is off it may be worse than "nine"
     key:        of jax.random; seed i is drawn from `fold_in(key, i)`, whatever the number of seeds
     plant:      default `Plant()`
     gains:      default `Gains()`
     weights:    (9,) of "nine", 1 / variance; default: from what `plant` says of its errors, as "learned"
-                has it, too
+                has it, too: these two know the true variances, which no other feedback needs
 
     Pose feedback maps the error (v, w) to leg rates by the Jacobian at the estimate. The error is taken
     against the reference as late as a perfect actuator with this delay and lag would be, plant.delay
     samples and the lag, and the feed-forward is of the reference itself, so that an ideal plant follows it.
+
+    A seed that is not OK has NaN in place of its poses, errors and times: SINGULAR where the machine came
+    within 1e-2 of a type II singularity (its legs then no longer tell where the platform goes),
+    STALLED where its loops would not close, NONFINITE where an estimate was lost. float64 only.
     """
     require_nine_rows("simulate_control", stewart)
     if feedback not in FEEDBACKS:
@@ -95,17 +102,30 @@ def simulate_control(
         raise ValueError(
             f"reference must come from circle_reference or step_reference, got {type(reference).__name__}"
         )
-    plant, gains = plant or Plant(), gains or Gains()
+    if not checks.is_concrete((stewart, weights)) or checks.is_staged():
+        raise ValueError("simulate_control takes known values, call it outside of jit")
+    if stewart.base.dtype != np.float64:
+        raise ValueError(f"simulate_control needs float64 (pk_jax.enable_x64()), got {stewart.base.dtype}")
+    plant = Plant() if plant is None else plant
+    gains = Gains() if gains is None else gains
+    key = checked_key(key)
     check_plant(plant)
     check_gains(gains)
     seeds = checks.is_count("seeds", seeds, most=100_000)
-    method = method_for("simulate_control", stewart, None) if feedback in ("closed", "nine") else None
+    method = method_for("simulate_control", stewart, None) if feedback in MEASURED else None
     weights = checks.real_array("weights", weights_of(plant) if weights is None else weights)
     checks.has_shape("weights", weights, (ROWS,))
     checks.is_positive("weights", weights)
+    checks.is_finite("weights", weights)
     samples = round(reference.duration / plant.period)
     if not 2 <= samples <= 10_000_000:
         raise ValueError(f"duration over period must be from 2 to 10,000,000 samples, got {samples}")
+    late = plant.delay * plant.period + plant.lag
+    if not (late < reference.duration and reference.settled_after < (samples - 1) * plant.period):
+        raise ValueError(
+            f"the reference is over before it counts: {reference.duration:g} s, of which errors count from "
+            f"{reference.settled_after:g} s on, sampled every {plant.period:g} s and {late:g} s late"
+        )
     keys = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(seeds))
     sampled = sampled_reference(stewart, reference, plant, samples)
     numbers = jax.tree.map(lambda value: jnp.asarray(value, stewart.base.dtype), (plant, gains))
@@ -153,15 +173,16 @@ def _sampled(stewart, start, pose_at, period, late, samples):
 
 
 class Learned(NamedTuple):
-    """Constant errors of the legs' encoders, as far as they are known."""
+    """Constant errors of the nine encoders, as far as they are known."""
 
-    bias: jax.Array  # (6,)
-    variance: jax.Array  # (6, 6)
+    bias: jax.Array  # (9,)
+    variance: jax.Array  # (9, 9)
 
 
-def _unlearned(plant: Plant, like: jax.Array) -> Learned:
+def _unlearned(plant: Plant, dtype: Any) -> Learned:
     """What is known of the encoders before anything is measured."""
-    return Learned(0 * like, plant.encoder_bias**2 * jnp.eye(LEGS, dtype=like.dtype))
+    variances = jnp.stack([plant.encoder_bias**2] * LEGS + [plant.sensor_bias**2] * (ROWS - LEGS))
+    return Learned(jnp.zeros(ROWS, dtype), jnp.diag(variances).astype(dtype))
 
 
 class _Loop(NamedTuple):
@@ -176,6 +197,7 @@ class _Loop(NamedTuple):
     estimate: SE3
     learned: Learned
     is_closed: jax.Array  # () so far
+    is_clear: jax.Array  # () so far: no singularity came near
 
 
 class _Record(NamedTuple):
@@ -206,8 +228,9 @@ def _run(stewart, stage, plant, gains, weights, sampled, key, *, feedback, metho
         integral=zero,
         error=zero,
         estimate=sampled.start,
-        learned=_unlearned(plant, zero),
+        learned=_unlearned(plant, legs.dtype),
         is_closed=jnp.asarray(True),
+        is_clear=jnp.asarray(True),
     )
 
     def sample(state: _Loop, given):
@@ -215,6 +238,7 @@ def _run(stewart, stage, plant, gains, weights, sampled, key, *, feedback, metho
         pose = _newton(built, state.legs, state.pose)
         off = jnp.max(jnp.abs(built.inverse(pose)[:LEGS] - state.legs))
         is_closed = state.is_closed & (off <= CLOSED_TO * stewart.length())
+        is_clear = state.is_clear & (_clearance(built, pose) > CLEAR_ABOVE)
         measured = read(jax.random.fold_in(of_noise, k), built.inverse(pose), bias, plant)
 
         estimate, learned = state.estimate, state.learned
@@ -239,19 +263,28 @@ def _run(stewart, stage, plant, gains, weights, sampled, key, *, feedback, metho
 
         waiting = jnp.concatenate([state.waiting, command[None]])
         legs, leg_rates = driven(state.legs, state.rates, waiting[0], plant)
-        after = _Loop(legs, leg_rates, pose, waiting[1:], integral, error, estimate, learned, is_closed)
+        after = _Loop(
+            legs, leg_rates, pose, waiting[1:], integral, error, estimate, learned, is_closed, is_clear
+        )
         said = jax.tree.map(lambda leaf: leaf * jnp.nan, estimate) if feedback == "joint" else estimate
         return after, _Record(pose, said, state.legs, command)
 
     given = (jnp.arange(sampled.legs.shape[0]), sampled.late, sampled.legs, sampled.rates)
     state, records = lax.scan(sample, state, given)
-    return records, state.is_closed
+    return records, state.is_closed, state.is_clear
 
 
 def length_jacobian(stewart: Stewart, pose: SE3) -> jax.Array:
     """Rates of all lengths of a twist. -> (k, 6)"""
     unweighted = LengthErrors.of(stewart, jnp.ones(stewart.base.shape[0], stewart.base.dtype))
     return unweighted.linearize(pose, stewart.inverse(pose))[1]
+
+
+def _clearance(stewart: Stewart, pose: SE3) -> jax.Array:
+    """Lower bound of the least singular value of the legs, lengths over length(). -> ()"""
+    rows = length_jacobian(stewart, pose)[:LEGS]
+    inverse = jnp.linalg.inv(rows * jnp.where(jnp.arange(6) < 3, 1, 1 / stewart.length()))
+    return 1 / jnp.sqrt(jnp.sum(inverse**2))
 
 
 def _newton(stewart: Stewart, legs: jax.Array, pose: SE3) -> SE3:
@@ -278,41 +311,46 @@ def _least_squares(stewart: Stewart, pose: SE3, measured: jax.Array, weights: ja
 def _learning(
     stewart: Stewart, pose: SE3, measured: jax.Array, learned: Learned, plant: Plant
 ) -> tuple[SE3, Learned]:
-    """Pose and constant errors of the legs together: the pose free in every sample, the errors remembered.
+    """Pose and constant errors together: the pose free in every sample, the errors remembered.
 
     With S the covariance of what is read, the pose minimizes r^T S^-1 r; what is left of r then
     updates the errors as in a Kalman filter.
     """
     bias, variance = learned
-    legs, sensors = variances_of(plant)
-    spread = jnp.diag(
-        jnp.repeat(jnp.stack([legs, sensors]), np.array([LEGS, ROWS - LEGS]), total_repeat_length=ROWS)
-    )
-    weights = jnp.linalg.inv(spread.at[:LEGS, :LEGS].add(variance))
-    corrected = measured.at[:LEGS].add(-bias)
+    legs, sensors = white_variances(plant)
+    spread = jnp.diag(jnp.stack([legs] * LEGS + [sensors] * (ROWS - LEGS)))
+    weights = jnp.linalg.inv(spread + variance)
+    corrected = measured - bias
     pose = _least_squares(stewart, pose, corrected, weights)
     jacobian = length_jacobian(stewart, pose)
     along = weights @ jacobian
     left = weights - along @ jnp.linalg.solve(jacobian.T @ along, along.T)
-    off = corrected - stewart.inverse(pose)
-    bias = bias + variance @ (weights @ off)[:LEGS]
-    variance = variance - variance @ left[:LEGS, :LEGS] @ variance
-    return pose, Learned(bias, (variance + variance.T) / 2 + DRIFT**2 * _unlearned(plant, bias).variance)
+    bias = bias + variance @ weights @ (corrected - stewart.inverse(pose))
+    variance = variance - variance @ left @ variance
+    wander = DRIFT**2 * plant.period * _unlearned(plant, bias.dtype).variance
+    return pose, Learned(bias, (variance + variance.T) / 2 + wander)
 
 
 def _summed_up(reference: Reference, plant: Plant, size: float, sampled: Sampled, runs: tuple) -> Simulation:
-    records, is_closed = runs
+    records, is_closed, is_clear = runs
     time = plant.period * np.arange(sampled.legs.shape[0])
     off_position, off_rotation = _errors(records.pose, sampled.late)
+    is_finite = jnp.all(jnp.isfinite(records.command), axis=(1, 2)) & jnp.all(
+        jnp.isfinite(off_position), axis=1
+    )
+    status = jnp.where(is_closed, Status.OK, Status.STALLED)
+    status = jnp.where(is_clear, status, Status.SINGULAR)
+    status = jnp.where(is_finite, status, Status.NONFINITE).astype(jnp.int32)
+    is_ok = status == Status.OK
+    masked = lambda leaf: jnp.where(is_ok.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan)
     counts = time >= reference.settled_after
     rms = lambda off: jnp.sqrt(jnp.mean(off[:, counts] ** 2, axis=1))
-    is_finite = jnp.all(jnp.isfinite(off_position), axis=1)
-    settling = jnp.full(is_finite.shape, jnp.nan)
+    settling = jnp.full(is_ok.shape, jnp.nan)
     if reference.settled_after == 0:
         # position and length() times rotation together
         off = np.hypot(np.asarray(off_position), size * np.asarray(off_rotation))
         settling = jnp.asarray(_settling_time(time, off))
-    return Simulation(
+    found = Simulation(
         time=jnp.asarray(time),
         desired=sampled.late,
         pose=records.pose,
@@ -324,8 +362,10 @@ def _summed_up(reference: Reference, plant: Plant, size: float, sampled: Sampled
         rms_position=rms(off_position),
         rms_rotation=rms(off_rotation),
         settling_time=settling,
-        status=jnp.where(is_closed & is_finite, Status.OK, Status.STALLED),
+        status=status,
     )
+    kept = jax.tree.map(masked, found._replace(time=None, desired=None, status=None))
+    return kept._replace(time=found.time, desired=found.desired, status=status)
 
 
 @jax.jit
@@ -337,7 +377,11 @@ def _errors(pose: SE3, desired: SE3) -> tuple[jax.Array, jax.Array]:
 
 
 def _settling_time(time: np.ndarray, off: np.ndarray) -> np.ndarray:
-    """From when on errors (seeds, n) stay within 2 % of what they were at first; NaN: never. -> (seeds,)"""
+    """From when on errors (seeds, n) stay within 2 % of what they were at first, to the end; NaN: never.
+
+    At least for a twentieth of the run: who crosses the band at the end has not settled. -> (seeds,)
+    """
     is_off = ~(off <= SETTLED * off[:, :1])
     after = np.where(is_off, np.arange(time.size), -1).max(axis=1) + 1
-    return np.where(after < time.size, time[np.minimum(after, time.size - 1)], np.nan)
+    has_settled = after <= (1 - STAYS_FOR) * time.size
+    return np.where(has_settled, time[np.minimum(after, time.size - 1)], np.nan)

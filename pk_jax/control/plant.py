@@ -59,25 +59,43 @@ def check_plant(plant: Plant) -> None:
 def check_gains(gains: Gains) -> None:
     if not isinstance(gains, Gains):
         raise ValueError(f"gains must be a pk_jax.Gains, got {type(gains).__name__}")
-    for name, value in gains._asdict().items():
-        if not np.isfinite(value):
-            raise ValueError(f"gains.{name} must be finite, got {value!r}")
+    if not isinstance(gains.anti_windup, bool | np.bool_ | int | float):
+        raise ValueError(f"gains.anti_windup must be true or false, got {gains.anti_windup!r}")
+    for name in ("kp", "ki", "kd", "feed_forward"):
+        is_finite_number(f"gains.{name}", getattr(gains, name))
 
 
-def variances_of(plant: Any) -> tuple[Any, Any]:
+def is_finite_number(name: str, value: Any) -> None:
+    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not (is_number and np.isfinite(value)):
+        raise ValueError(f"{name} must be finite, got {value!r}")
+
+
+def checked_key(key: Any) -> jax.Array:
+    """One key of jax.random, new style or old."""
+    dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
+    is_new = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
+    if not (is_new or (dtype == np.uint32 and shape == (2,))):
+        raise ValueError(
+            f"key must be one key of jax.random, such as jax.random.key(0), got {type(key).__name__}"
+        )
+    return key
+
+
+def white_variances(plant: Any) -> tuple[Any, Any]:
     """Variances of the lengths of a leg and of a sensor, without the constant errors of the encoders.
 
-    A joint's error moves a length by its component along it; there are two joints.
+    A joint's error moves a length by its component along it, differently in every pose; there are two joints.
     """
     read = plant.noise**2 + plant.quantum**2 / 12 + TINIEST**2
-    sensors = plant.sensor_bias**2 + 2 * plant.sensor_geometry_error**2
-    return read + 2 * plant.geometry_error**2, read + sensors
+    return read + 2 * plant.geometry_error**2, read + 2 * plant.sensor_geometry_error**2
 
 
 def weights_of(plant: Plant) -> np.ndarray:
     """1 / variance of the nine lengths, from what is known of a plant's errors. -> (9,)"""
-    legs, sensors = variances_of(plant)
-    return np.repeat(1 / np.array([legs + plant.encoder_bias**2, sensors]), [LEGS, ROWS - LEGS])
+    legs, sensors = white_variances(plant)
+    variances = np.array([legs + plant.encoder_bias**2, sensors + plant.sensor_bias**2])
+    return np.repeat(1 / variances, [LEGS, ROWS - LEGS])
 
 
 class Errors(NamedTuple):

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pk_jax import checks
+from pk_jax.control.plant import is_finite_number
 from pk_jax.geometry import rotations
 from pk_jax.geometry.poses import retract
 from pk_jax.geometry.se3 import SE3
@@ -42,13 +43,13 @@ def circle_reference(
     frequency:  Hz
     tilt:       rad
     ramp:       s in which radius and tilt grow from zero, smooth to the second derivative
-    duration:   s, more than ramp; errors count from half a second after the ramp on
+    duration:   s, more than ramp; errors count from half a second after the ramp on, or from the middle of
+                what is left where that is earlier
     """
     start = _home_of(mech, centre)
     for name, value in (("radius", radius), ("frequency", frequency), ("ramp", ramp), ("duration", duration)):
         _is_positive(name, value)
-    if not np.isfinite(tilt):
-        raise ValueError(f"tilt must be finite, got {tilt}")
+    is_finite_number("tilt", tilt)
     if not duration > ramp:
         raise ValueError(f"duration must be more than the ramp, {ramp} s, got {duration}")
 
@@ -83,9 +84,15 @@ def _home_of(mech: Mechanism, centre: Any) -> SE3:
         raise ValueError(f"a reference is for platforms in space, got {type(mech).__name__}")
     if centre is not None and not isinstance(centre, SE3):
         raise ValueError(f"centre must be a pk_jax.SE3, got {type(centre).__name__}")
-    return home if centre is None else centre
+    if centre is None:
+        return home
+    numbers = [np.ravel(centre.translation), np.ravel(centre.rotation)]
+    if centre.translation.ndim != 1 or not np.all(np.isfinite(np.concatenate(numbers))):
+        raise ValueError("centre must be one pose of finite numbers")
+    return centre
 
 
-def _is_positive(name: str, value: float) -> None:
-    if not (np.isfinite(value) and value > 0):
+def _is_positive(name: str, value: Any) -> None:
+    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not (is_number and np.isfinite(value) and value > 0):
         raise ValueError(f"{name} must be positive and finite, got {value}")

@@ -16,7 +16,7 @@ from pk_jax.design import ascent
 from pk_jax.geometry.se3 import SE3
 from pk_jax.geometry.spread import evenly
 from pk_jax.kinematics.batching import home_shapes, rows_of
-from pk_jax.kinematics.linear_stage import ROWS, frame_of, matrix_of
+from pk_jax.kinematics.linear_stage import IN_PLANE_TO, ROWS, at_least, frame_of, matrix_of
 from pk_jax.mechanisms.stewart import LEGS, Stewart
 from pk_jax.status import Status
 
@@ -76,11 +76,11 @@ def place_sensors(
     checks.has_shape("weights", weights, (ROWS,))
     checks.is_positive("weights", weights)
 
+    _require_flat(np.asarray(stewart.platform))
     room = _room_of(stewart, radius, platform_radius)
     problem = _Problem(stewart, room, poses, weights, jnp.asarray(most_condition, weights.dtype))
     size = 6 if platform_radius is None else 12
-    boxes = jnp.asarray(0.05 + 0.9 * evenly(starts, size), stewart.base.dtype)
-    states = jax.vmap(ascent.begin)(boxes)
+    states = jax.vmap(ascent.begin)(_starts(problem, starts, size))
     for done in range(1, steps + 1):
         states = _step(problem, states)
         if report is not None:
@@ -97,6 +97,22 @@ def place_sensors(
     status = Status.SINGULAR if layout.reason else Status.OK if is_done else Status.STEP_LIMIT
     gain = float(gain_over(placed, poses, weights))
     return SensorPlacement(placed, gain, before, layout, gains, int(jnp.sum(states.evaluations)), status)
+
+
+def _require_flat(platform: np.ndarray) -> None:
+    """ValueError where the platform's joints are not in one plane."""
+    sizes = np.linalg.svd(platform - platform.mean(axis=0), compute_uv=False)
+    if not sizes[2] <= at_least(IN_PLANE_TO, platform.dtype) * sizes[0]:
+        raise ValueError(
+            "place_sensors: all platform joints must lie in one plane, in which the closed form needs T1, T2, T3"
+        )
+
+
+def _starts(problem: _Problem, count: int, size: int) -> jax.Array:
+    """The best of four times as many points spread evenly over the unit box. -> (count, size)"""
+    boxes = jnp.asarray(0.05 + 0.9 * evenly(4 * count, size), problem.weights.dtype)
+    scores = jax.jit(jax.vmap(partial(_score, problem)))(boxes)
+    return boxes[jnp.argsort(jnp.where(jnp.isnan(scores), jnp.inf, -scores))[:count]]
 
 
 def gain_over(stewart: Stewart, poses: SE3, weights: jax.Array) -> jax.Array:

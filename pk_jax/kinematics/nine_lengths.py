@@ -20,7 +20,7 @@ from pk_jax.geometry import rotations
 from pk_jax.geometry.poses import retract, tangent_size
 from pk_jax.geometry.se3 import SE3
 from pk_jax.kinematics import elimination, lane_newton, newton
-from pk_jax.kinematics.batching import is_possible, over_rows, rows_of, where, without_derivatives
+from pk_jax.kinematics.batching import is_possible, over_rows, rows_of, same_size, where, without_derivatives
 from pk_jax.kinematics.closed_form import candidates, closed_form, closed_form_on_lanes, mirrored
 from pk_jax.kinematics.closure import pose_scale
 from pk_jax.kinematics.entrywise import entrywise
@@ -74,7 +74,7 @@ def nine_length_pose(
     image fits as well; it is the one on the side of home (`nine_length_candidates` has both).
 
     Status: OK; INCONSISTENT: the weighted RMS error exceeds 1 % of the mean length, in spite of twelve
-    other starts; STALLED: no start came to rest; SINGULAR: nine lengths do not fix the pose there, or the
+    other starts; STALLED: no start came to rest; SINGULAR: nine lengths, as weighted, do not fix the pose there, or the
     linear stage is singular; BAD_INPUT: NaN, infinity, or a length <= 0.
 
     The pose carries exact derivatives in lengths, weights and geometry at any residual, zero on
@@ -91,6 +91,8 @@ def nine_length_pose(
     lengths, many = rows_of("lengths", lengths, one, numpy=is_known)
     weights = np.ones(ROWS, one.dtype) if weights is None else weights
     weights, weighted = rows_of("weights", weights, one, numpy=is_known)
+    if many and weighted:
+        same_size((lengths, weights), (many, weighted))
     if checks.is_concrete(weights):
         checks.is_finite("weights", weights)
         checks.is_positive("weights", weights)
@@ -403,10 +405,12 @@ def _persist(stewart: Stewart, stage: Stage, lengths: jax.Array, weights: jax.Ar
     is_below = stage.is_planar & ~_is_above(stage, best.point)  # the mirror image fits as well
     pose = where(is_below, mirrored(stage, best.point), best.point)
     judged = judge(errors, pose, lengths)
+    status = _verdict(judged, best.is_stationary)
+    is_off = (status == Status.STALLED) & (judged.share >= INCONSISTENT_ABOVE)  # from every start
     again = found._replace(
         pose=pose,
         covariance=judged.covariance,
-        status=_verdict(judged, best.is_stationary).astype(jnp.int32),
+        status=jnp.where(is_off, Status.INCONSISTENT, status).astype(jnp.int32),
         residual=judged.residual,
         steps=found.steps + best.steps,
         sigma_min=judged.sigma_min,

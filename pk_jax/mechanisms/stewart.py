@@ -27,7 +27,7 @@ class Stewart(LegMechanism):
     unit vectors in the base frame and, pointing from the platform to the base, in the platform
     frame (default: the legs at home). Pose `SE3`, joints the k lengths. One unit of length.
 
-    The six legs of a platform whose joints are affine copies of the base's planar ones (two regular
+    The six legs of a platform whose joints lie on a conic and are affine copies of the base's (two regular
     hexagons, say) are dependent in every pose, "architecturally singular", and refused.
 
     Source: Stewart 1965, Proc. IMechE 180; with nine rows both embodiments of Ryu et al., patent

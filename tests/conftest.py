@@ -2,6 +2,7 @@
 
 import os
 
+import jax
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -35,3 +36,12 @@ def run(capsys, monkeypatch):
         return code, shown.out, shown.err
 
     return run
+
+
+@pytest.fixture
+def compiled_in_haste():
+    """For what is compiled once and run for a moment: without most optimizations that is sooner done."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)

@@ -136,6 +136,7 @@ idle = jax.jit(jax.vmap(self_motions, (None, 0, 0)))
 # ---------------------------------------------------------------- laws, and the neutral configuration
 
 
+@pytest.mark.usefixtures("compiled_in_haste")
 @pytest.mark.parametrize("mech", IRREGULAR.values(), ids=IRREGULAR)
 def test_laws_hold(mech):
     assert len(pk.check_mechanism(mech)) >= 17

@@ -46,12 +46,7 @@ REAL = BIASED._replace(rate_limit=0.3, sensor_bias=3e-5, geometry_error=5e-5, se
 ODD = Gains(kp=45.0, ki=30.0, kd=0.05, feed_forward=0.8)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compiled_in_haste():
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
 
 def on_numpy(tree):

@@ -39,15 +39,6 @@ def test_laws_hold(build):
 # ---------------------------------------------------------------- a good mechanism to break
 
 
-@pytest.fixture
-def compiled_in_haste():
-    """Every fault is compiled for itself and run once: without most optimizations that is sooner done."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
-
-
 IN_HASTE = pytest.mark.usefixtures("compiled_in_haste")
 
 

@@ -82,6 +82,7 @@ LAWFUL = {
 SLOW = {"4-rrr", "5-link", "5-link, coaxial"}  # to compile; other arms and legs obey the same code
 
 
+@pytest.mark.usefixtures("compiled_in_haste")
 @pytest.mark.parametrize(
     "build",
     [

@@ -104,15 +104,27 @@ def _require_flat(platform: np.ndarray) -> None:
     sizes = np.linalg.svd(platform - platform.mean(axis=0), compute_uv=False)
     if not sizes[2] <= at_least(IN_PLANE_TO, platform.dtype) * sizes[0]:
         raise ValueError(
-            "place_sensors: all platform joints must lie in one plane, in which the closed form needs T1, T2, T3"
+            "place_sensors: all platform joints must lie in one plane, that of the T1, T2, T3 to be found"
         )
 
 
 def _starts(problem: _Problem, count: int, size: int) -> jax.Array:
-    """The best of four times as many points spread evenly over the unit box. -> (count, size)"""
+    """Points spread over the unit box, none of the worse half; first those that came. -> (count, size)"""
     boxes = jnp.asarray(0.05 + 0.9 * evenly(4 * count, size), problem.weights.dtype)
     scores = jax.jit(jax.vmap(partial(_score, problem)))(boxes)
-    return boxes[jnp.argsort(jnp.where(jnp.isnan(scores), jnp.inf, -scores))[:count]]
+    scores = jnp.where(jnp.isnan(scores), -jnp.inf, scores)
+    boxes = boxes[jnp.argsort(scores < jnp.median(scores), stable=True)[:count]]
+    if problem.stewart.base.shape[0] == LEGS:
+        return boxes
+    squares = (problem.room.base, problem.stewart.base), (problem.room.platform, problem.stewart.platform)
+    came = [_in_square(square, joints[LEGS:]) for square, joints in squares[: size // 6]]
+    return boxes.at[0].set(jnp.clip(jnp.concatenate(came), 0, 1))
+
+
+def _in_square(square: tuple[jax.Array, jax.Array], joints: jax.Array) -> jax.Array:
+    """Joints (3, 3) in the unit box of their square. -> (6,)"""
+    middle, axes = square
+    return (((joints - middle) @ axes.T / jnp.sum(axes**2, axis=1) + 1) / 2).ravel()
 
 
 def gain_over(stewart: Stewart, poses: SE3, weights: jax.Array) -> jax.Array:

@@ -74,8 +74,8 @@ def nine_length_pose(
     image fits as well; it is the one on the side of home (`nine_length_candidates` has both).
 
     Status: OK; INCONSISTENT: the weighted RMS error exceeds 1 % of the mean length, in spite of twelve
-    other starts; STALLED: no start came to rest; SINGULAR: nine lengths, as weighted, do not fix the pose there, or the
-    linear stage is singular; BAD_INPUT: NaN, infinity, or a length <= 0.
+    other starts; STALLED: no start came to rest; SINGULAR: nine lengths, as weighted, do not fix the pose
+    there, or the linear stage is singular; BAD_INPUT: NaN, infinity, or a length <= 0.
 
     The pose carries exact derivatives in lengths, weights and geometry at any residual, zero on
     rows that are not OK. ValueError for joints outside the T plane, and for layouts whose linear stage is

@@ -38,9 +38,9 @@ def run(capsys, monkeypatch):
     return run
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def compiled_in_haste():
-    """For what is compiled once and run for a moment: without most optimizations that is sooner done."""
+    """For files that mostly compile: without most optimizations XLA is sooner done, and computes the same."""
     before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", True)
     yield

@@ -25,6 +25,8 @@ from pk_jax.geometry.poses import (
     tangent_zero,
 )
 
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
 BATCH = 6
 POINTS = np.random.default_rng(0).uniform(-1, 1, (5, 3))
 

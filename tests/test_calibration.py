@@ -12,6 +12,8 @@ from refusals import said_by
 
 import pk_jax as pk
 
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 LOG = str(EXAMPLES / "hexapod_log.csv")
 

@@ -19,6 +19,8 @@ import pk_jax as pk
 from pk_jax.files.mechanism_file import load_mechanism, save_mechanism
 from pk_jax.kinematics.jacobian import self_motions
 
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
 NAN = np.nan
 ROWS = 200
 DEFAULT = pk.CasingOscillator()
@@ -136,7 +138,6 @@ idle = jax.jit(jax.vmap(self_motions, (None, 0, 0)))
 # ---------------------------------------------------------------- laws, and the neutral configuration
 
 
-@pytest.mark.usefixtures("compiled_in_haste")
 @pytest.mark.parametrize("mech", IRREGULAR.values(), ids=IRREGULAR)
 def test_laws_hold(mech):
     assert len(pk.check_mechanism(mech)) >= 17

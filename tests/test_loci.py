@@ -11,6 +11,8 @@ from scipy.spatial import cKDTree
 
 import pk_jax as pk
 
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
 STEP = 0.012  # of the box: greatest distance of neighbours on a curve
 ONE, TWO = pk.SingularityKind.TYPE_I, pk.SingularityKind.TYPE_II
 

@@ -17,6 +17,8 @@ from pk_jax.kinematics.closed_form import closed_form
 from pk_jax.kinematics.linear_stage import matrix_of, stage_of
 from pk_jax.kinematics.quadrics import quadrics_of
 
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
 NAN, INF = np.nan, np.inf
 EDGES = ((0, 2), (0, 1), (1, 0), (1, 2), (2, 1), (2, 0))  # B_i = k T_a + (1 - k) T_b, eq. (1)
 GENERAL, PLANAR = 1, 2  # the two embodiments

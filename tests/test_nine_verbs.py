@@ -12,6 +12,8 @@ from pk_jax.files.simulated import Plant, set_by
 from pk_jax.papers import nine_lengths as paper
 from pk_jax.viz import nine_lengths as viz
 
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
 NINE = "nine-lengths"
 
 

@@ -12,6 +12,8 @@ import pk_jax as pk
 from pk_jax.geometry.poses import place, place_jacobian, retract, turned, unturned
 from pk_jax.kinematics.inverse import working_modes
 
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
 BATCH = 16  # rows of every batch of closed forms here, so that each is compiled once
 
 
@@ -82,7 +84,6 @@ LAWFUL = {
 SLOW = {"4-rrr", "5-link", "5-link, coaxial"}  # to compile; other arms and legs obey the same code
 
 
-@pytest.mark.usefixtures("compiled_in_haste")
 @pytest.mark.parametrize(
     "build",
     [

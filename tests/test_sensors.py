@@ -31,6 +31,8 @@ import pk_jax as pk
 from pk_jax import Status
 from pk_jax.kinematics.closed_form import closed_form
 
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
 NAN, INF = np.nan, np.inf
 SINGULAR, RANK = paired(rng_of(11)), 3  # legs in pairs, sensors on the lines through their feet
 

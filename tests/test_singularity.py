@@ -12,6 +12,8 @@ import pk_jax as pk
 from pk_jax.papers.planar_screws import geometric_screws, singular_cases
 from pk_jax.status import Status
 
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
 REGULAR, TYPE_I, TYPE_II, TYPE_III, FLAT = list(pk.SingularityKind)[1:]
 UNKNOWN = pk.SingularityKind.UNKNOWN
 NAN, INF = np.nan, np.inf

@@ -17,6 +17,8 @@ from pk_jax.geometry.poses import place, retract
 from pk_jax.kinematics.inverse import working_modes
 from pk_jax.papers.planar_screws import geometric_screws, singular_cases
 
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
 NAN, INF = np.nan, np.inf
 ROWS = 32
 

@@ -12,6 +12,8 @@ from pk_jax.geometry import poses, rotations
 from pk_jax.mechanisms import stewart
 from pk_jax.mechanisms.catalogue import CATALOGUE
 
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
 SEMI = pk.catalogued("semi-regular-stewart")
 NAN = np.nan
 

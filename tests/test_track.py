@@ -10,6 +10,8 @@ import pk_jax as pk
 from pk_jax import Status
 from pk_jax.geometry.poses import difference
 
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
 SEMI = pk.catalogued("semi-regular-stewart")
 NAN = np.nan
 OK, LATER = Status.OK, Status.INCOMPLETE

@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 import pk_jax as pk
 from pk_jax.geometry.poses import retract
 
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
 NAN = np.nan
 ROWS = 8
 CASING = pk.CasingOscillator()

@@ -1,1 +1,1 @@
-"""What follows from the Jacobians: indices and their integrals, singularities, limits and proofs."""
+"""What follows from the Jacobians: indices and their integrals, singularities, limits and proofs, noise."""

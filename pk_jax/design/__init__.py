@@ -1,1 +1,1 @@
-"""Design variables, the composite index, and its maximization by gradients."""
+"""Design variables, the composite index, gradient ascent; sensors placed, geometries identified."""

@@ -372,7 +372,8 @@ def locus(first):
     return pk.singularity_locus(DEFAULT, (first, "yaw"), ranges=ranges, free=LOCKED, nodes=41)
 
 
-@pytest.mark.parametrize("first", [pytest.param("roll", marks=pytest.mark.soak), "pitch"])
+@pytest.mark.soak
+@pytest.mark.parametrize("first", ["roll", "pitch"])
 def test_loci_are_of_type_ii_and_lock_the_carriage(first):
     found = locus(first)
     assert found.axes == (first, "yaw") and found.units == (0, 0)
@@ -417,6 +418,7 @@ def test_the_locus_in_roll_and_yaw_is_the_root_of_the_closed_form():
     np.testing.assert_allclose(sorted(np.rad2deg(crossings)), [-ROLL, ROLL], rtol=0, atol=0.1)
 
 
+@pytest.mark.soak
 def test_the_locus_in_pitch_and_yaw_is_straight():
     """Pitch atan(s / r) and 90 degrees, whatever the yaw: both, from end to end, and nothing else."""
     every = np.concatenate([curve.coordinates for curve in locus("pitch").curves])

@@ -184,13 +184,13 @@ def test_gains_take_one_pose_or_many(placed):
 def workspace():
     rng = rng_of(38)
     platform = some_platform(rng, PLANAR, most=100)
-    return (
-        platform,
-        some_poses(rng, 4, tilt=20),
-        pk.place_sensors(
-            platform, some_poses(rng_of(39), 4, tilt=20), radius=0.8, starts=4, steps=30, most_condition=4.0
-        ),
-    )
+    return platform, some_poses(rng, 4, tilt=20)
+
+
+@pytest.fixture(scope="module")
+def placement(workspace):
+    poses = some_poses(rng_of(39), 4, tilt=20)
+    return pk.place_sensors(workspace[0], poses, radius=0.8, starts=4, steps=30, most_condition=4.0)
 
 
 def gain_over(platform, poses):
@@ -200,8 +200,9 @@ def gain_over(platform, poses):
     return np.sqrt(np.mean(np.einsum("nii,i->n", inverse, [1, 1, 1, size**2, size**2, size**2])))
 
 
-def test_placed_sensors_pass_less_noise_on(workspace):
-    platform, _, found = workspace
+@pytest.mark.soak  # notebook 05 places some, too
+def test_placed_sensors_pass_less_noise_on(workspace, placement):
+    platform, found = workspace[0], placement
     poses = some_poses(rng_of(39), 4, tilt=20)
     np.testing.assert_allclose(found.gain_before, gain_over(platform, poses), rtol=1e-9)
     np.testing.assert_allclose(found.gain, gain_over(found.stewart, poses), rtol=1e-9)
@@ -210,8 +211,9 @@ def test_placed_sensors_pass_less_noise_on(workspace):
     assert found.evaluations > 4
 
 
-def test_placed_sensors_are_where_they_may_be_and_can_do(workspace):
-    platform, _, found = workspace
+@pytest.mark.soak  # notebook 05 places some, too
+def test_placed_sensors_are_where_they_may_be_and_can_do(workspace, placement):
+    platform, found = workspace[0], placement
     assert found.layout.rank == 6 and found.layout.reason is None and found.layout.condition < 4.1
     assert found.status in (Status.OK, Status.STEP_LIMIT)
     for name in ("base", "platform"):
@@ -222,15 +224,15 @@ def test_placed_sensors_are_where_they_may_be_and_can_do(workspace):
 
 
 @pytest.mark.soak
-def test_placed_sensors_give_the_pose(workspace):
-    found, poses = workspace[2], some_poses(rng_of(40), 4, tilt=20)
+def test_placed_sensors_give_the_pose(placement):
+    found, poses = placement, some_poses(rng_of(40), 4, tilt=20)
     answer = pk.nine_length_pose(found.stewart, lengths_of(found.stewart, poses))
     assert error_of(answer.pose, poses) <= 1e-9
 
 
 @pytest.mark.soak
 def test_more_starts_are_never_worse(workspace):
-    platform, poses, _ = workspace
+    platform, poses = workspace
     few, many = (pk.place_sensors(platform, poses, radius=0.8, starts=n, steps=30) for n in (4, 12))
     np.testing.assert_allclose(many.gains[:4], few.gains, rtol=1e-6)
     assert many.gain <= few.gain * (1 + 1e-9)
@@ -238,7 +240,7 @@ def test_more_starts_are_never_worse(workspace):
 
 @pytest.mark.soak
 def test_moving_the_platform_joints_too_is_better_still(workspace):
-    platform, poses, _ = workspace
+    platform, poses = workspace
     legs = pk.Stewart(base=platform.base[:6], platform=platform.platform[:6])
     kept = pk.place_sensors(legs, poses, radius=0.8, starts=12, steps=60)
     moved = pk.place_sensors(legs, poses, radius=0.8, platform_radius=0.6, starts=24, steps=60)
@@ -255,7 +257,7 @@ def without_sensors(platform):
 
 
 def test_platforms_without_sensors_are_refused(workspace):
-    platform, poses, _ = workspace
+    platform, poses = workspace
     legs = without_sensors(platform)
     assert "nine rows" in said_by(pk.sensor_layout, legs)
     assert "nine rows" in said_by(pk.noise_gains, legs, poses)
@@ -268,7 +270,7 @@ def test_traced_layouts_are_refused(workspace):
 
 @pytest.mark.parametrize("function", [pk.noise_gains, pk.pose_covariance])
 def test_wrong_poses_and_weights_are_refused(function, workspace):
-    platform, poses, _ = workspace
+    platform, poses = workspace
     assert said_by(function, platform, np.ones(6)).startswith("pose must be a pk_jax.SE3")
     assert said_by(function, platform, poses, np.ones(6)).startswith("weights must have shape (9,)")
     for bad in (0.0, -1.0, NAN, INF):
@@ -293,12 +295,12 @@ def test_wrong_poses_and_weights_are_refused(function, workspace):
     ],
 )
 def test_wrong_wishes_are_refused_with_the_field(named, field, workspace):
-    platform, poses, _ = workspace
+    platform, poses = workspace
     assert said_by(pk.place_sensors, platform, poses, **{"radius": 0.5, **named}).startswith(field)
 
 
 def test_only_platforms_with_six_or_nine_rows_get_sensors(workspace):
-    platform, poses, _ = workspace
+    platform, poses = workspace
     eight = pk.Stewart(base=platform.base[:8], platform=platform.platform[:8])
     assert "six rows, or nine" in said_by(pk.place_sensors, eight, poses, radius=0.5)
     assert "six rows, or nine" in said_by(pk.place_sensors, None, poses, radius=0.5)

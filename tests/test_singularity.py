@@ -324,6 +324,7 @@ def test_loops_may_be_open_by_roundoff():
 # ---------------------------------------------------------------- in space
 
 
+@pytest.mark.soak  # notebook 02 turns it, too
 def test_a_stewart_platform_turned_by_ninety_degrees():
     """Fichter 1986: a semi-regular platform is singular at a yaw of 90 degrees, not at 0."""
     yaw = np.array([90.0, -90.0, 0.0, 89.0])

@@ -229,6 +229,7 @@ def weighted(mech, path):
     return jnp.sum(weights * jnp.where(jnp.isfinite(twists), jnp.sin(twists), 0))
 
 
+@pytest.mark.soak
 def test_derivatives_in_the_lengths_and_the_geometry():
     both = jax.jit(jax.value_and_grad(weighted, argnums=(0, 1)))
     in_mech, in_path = whole = both(SEMI, PATH)[1]

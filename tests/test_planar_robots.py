@@ -81,7 +81,13 @@ LAWFUL = {
 }
 
 
-SLOW = {"4-rrr", "5-link", "5-link, coaxial"}  # to compile; other arms and legs obey the same code
+SLOW = {
+    "3-rrr",
+    "3-rrr, irregular",
+    "4-rrr",
+    "5-link",
+    "5-link, coaxial",
+}  # to compile; other arms and legs obey the same code
 
 
 @pytest.mark.parametrize(

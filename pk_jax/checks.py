@@ -69,6 +69,11 @@ def has_shape(name: str, value: jax.Array, shape: tuple[int | None, ...]) -> Non
         raise ValueError(f"{name} must have shape {wanted}, got {tuple(value.shape)}")
 
 
+def is_number(value: Any) -> bool:
+    """Whether `value` is one finite real number; bools are none."""
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and np.isfinite(value)
+
+
 def is_finite(name: str, value: jax.Array) -> None:
     if not np.all(np.isfinite(value)):
         raise ValueError(f"{name} must be finite, got {_short(value)}")

@@ -70,6 +70,8 @@ def test_it_refuses_what_has_no_nine_lengths(run, tmp_path):
         (("simulate", NINE, "--plant", "mass=1"), "--plant must name one of period"),
         (("simulate", NINE, "--plant", "noise=loud"), "--plant must be NAME=VALUE"),
         (("simulate", NINE, "--plant", "lag=-1"), "plant.lag must be a finite number >= 0"),
+        (("simulate", NINE, "--plant", "delay=inf"), "plant.delay must be a finite number >= 0"),
+        (("simulate", NINE, "--plant", "delay=nan"), "plant.delay must be a finite number >= 0"),
         (("simulate", NINE, "--gain", "kp=inf"), "gains.kp must be finite"),
         (("simulate", NINE, "--radius", "-1"), "radius must be positive"),
         (("simulate", NINE, "--reference", "step", "--twist", "1,2"), "--twist must be six numbers"),

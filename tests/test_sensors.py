@@ -299,6 +299,13 @@ def test_wrong_wishes_are_refused_with_the_field(named, field, workspace):
     assert said_by(pk.place_sensors, platform, poses, **{"radius": 0.5, **named}).startswith(field)
 
 
+def test_poses_that_are_no_numbers_place_no_sensors(workspace):
+    platform, poses = workspace
+    lost = pk.SE3(poses.translation.at[1, 2].set(np.nan), poses.rotation)
+    assert said_by(pk.place_sensors, platform, lost, radius=0.5).startswith("poses must be finite")
+    assert said_by(pk.place_sensors, platform, poses, radius="1").startswith("radius must be positive")
+
+
 def test_only_platforms_with_six_or_nine_rows_get_sensors(workspace):
     platform, poses = workspace
     eight = pk.Stewart(base=platform.base[:8], platform=platform.platform[:8])

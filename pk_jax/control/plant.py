@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pk_jax import checks
 from pk_jax.kinematics.linear_stage import ROWS
 from pk_jax.mechanisms.stewart import LEGS, Stewart
 
@@ -46,8 +47,7 @@ def check_plant(plant: Plant) -> None:
     if not isinstance(plant, Plant):
         raise ValueError(f"plant must be a pk_jax.Plant, got {type(plant).__name__}")
     for name, value in plant._asdict().items():
-        is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-        if not (is_number and np.isfinite(value) and value >= 0):
+        if not (checks.is_number(value) and value >= 0):
             raise ValueError(f"plant.{name} must be a finite number >= 0, got {value!r}")
     for name in ("period", "rate_limit"):
         if not getattr(plant, name) > 0:
@@ -62,13 +62,8 @@ def check_gains(gains: Gains) -> None:
     if not isinstance(gains.anti_windup, bool | np.bool_ | int | float):
         raise ValueError(f"gains.anti_windup must be true or false, got {gains.anti_windup!r}")
     for name in ("kp", "ki", "kd", "feed_forward"):
-        is_finite_number(f"gains.{name}", getattr(gains, name))
-
-
-def is_finite_number(name: str, value: Any) -> None:
-    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not (is_number and np.isfinite(value)):
-        raise ValueError(f"{name} must be finite, got {value!r}")
+        if not checks.is_number(value := getattr(gains, name)):
+            raise ValueError(f"gains.{name} must be finite, got {value!r}")
 
 
 def checked_key(key: Any) -> jax.Array:

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from pk_jax import checks
-from pk_jax.control.plant import is_finite_number
 from pk_jax.geometry import rotations
 from pk_jax.geometry.poses import retract
 from pk_jax.geometry.se3 import SE3
@@ -49,7 +48,8 @@ def circle_reference(
     start = _home_of(mech, centre)
     for name, value in (("radius", radius), ("frequency", frequency), ("ramp", ramp), ("duration", duration)):
         _is_positive(name, value)
-    is_finite_number("tilt", tilt)
+    if not checks.is_number(tilt):
+        raise ValueError(f"tilt must be finite, got {tilt}")
     if not duration > ramp:
         raise ValueError(f"duration must be more than the ramp, {ramp} s, got {duration}")
 
@@ -93,6 +93,5 @@ def _home_of(mech: Mechanism, centre: Any) -> SE3:
 
 
 def _is_positive(name: str, value: Any) -> None:
-    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not (is_number and np.isfinite(value) and value > 0):
+    if not (checks.is_number(value) and value > 0):
         raise ValueError(f"{name} must be positive and finite, got {value}")

@@ -66,15 +66,18 @@ def place_sensors(
     poses, many = rows_of("poses", poses, home_shapes(stewart)[0])
     poses = poses if many else jax.tree.map(lambda leaf: leaf[None], poses)
     for name, value in (("radius", radius), ("platform_radius", platform_radius)):
-        if value is not None and not (np.isfinite(value) and value > 0):
+        if value is not None and not (checks.is_number(value) and value > 0):
             raise ValueError(f"{name} must be positive and finite, got {value}")
-    if not (np.isfinite(most_condition) and most_condition > 1):
+    if not (checks.is_number(most_condition) and most_condition > 1):
         raise ValueError(f"most_condition must be greater than 1, got {most_condition}")
     starts = checks.is_count("starts", starts, most=10_000)
     steps = checks.is_count("steps", steps, most=100_000)
     weights = checks.real_array("weights", np.ones(ROWS) if weights is None else weights)
     checks.has_shape("weights", weights, (ROWS,))
     checks.is_positive("weights", weights)
+    checks.is_finite("weights", weights)
+    for leaf in jax.tree.leaves(poses):
+        checks.is_finite("poses", leaf)
 
     _require_flat(np.asarray(stewart.platform))
     room = _room_of(stewart, radius, platform_radius)

@@ -34,7 +34,7 @@ def set_by(texts: Sequence[str], option: str, default: Any, metres: float) -> An
             raise ValueError(f"{option} must be NAME=VALUE, a number, got {text!r}") from None
         if isinstance(default, Plant) and name not in _NO_LENGTHS:
             number *= metres
-        is_whole = name == "delay" and number == int(number)
+        is_whole = name == "delay" and number.is_integer()
         found = found._replace(**{name: int(number) if is_whole else number})
     return found
 
@@ -63,12 +63,11 @@ def experiment_of(
     mech, metres = named.mechanism, named.metres
     require_nine_rows("simulate", mech)
     size = float(mech.length())
+    options = {} if duration is None else {"duration": duration}
     if kind == "circle":
-        options = {} if duration is None else {"duration": duration}
         radius = 0.2 * size if radius is None else radius * metres
         reference = circle_reference(mech, radius=radius, frequency=frequency, **options)
     else:
-        options = {} if duration is None else {"duration": duration}
         reference = step_reference(mech, _twist(twist, size, metres), **options)
     given = set_by(plant, "--plant", Plant(), metres), set_by(gains, "--gain", Gains(), 1.0)
     check_plant(given[0])

@@ -25,6 +25,7 @@ from pk_jax.kinematics.batching import (
     without_derivatives,
 )
 from pk_jax.kinematics.closure import pose_scale
+from pk_jax.kinematics.in_blocks import redo
 from pk_jax.kinematics.lane_newton import Home
 from pk_jax.kinematics.lanes import is_entries, split, stack
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
@@ -260,18 +261,11 @@ def _one_known(mech, home, joints, guess, order):
 def _again(
     mech: Mechanism, home: Home, joints: np.ndarray, guess: Any, found: ForwardKinematics
 ) -> ForwardKinematics:
-    """The lost rows of a batch once more, in blocks of few sizes so that few are compiled."""
+    """The lost rows of a batch once more."""
     lost = np.flatnonzero(np.asarray(found.status) == Status.STALLED)
     _warn_of_units(mech, joints[lost], np.asarray(home.joints))
     found = jax.tree.map(lambda leaf: np.array(leaf), found)
-    size = 16 if len(lost) <= 16 else 1024
-    for first in range(0, len(lost), size):
-        these = lost[first : first + size]
-        padded = np.resize(these, size)
-        taken = jax.tree.map(lambda leaf, padded=padded: leaf[padded], (joints, guess, found))
-        again = _persist_rows(mech, home, *taken)
-        for whole, part in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
-            whole[these] = np.asarray(part)[: len(these)]
+    redo(partial(_persist_rows, mech, home), lost, (joints, guess), found, most=1024)
     return found
 
 

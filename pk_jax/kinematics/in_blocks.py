@@ -42,6 +42,21 @@ def in_blocks(run: Callable[[int, int], None], count: int, block: int, workers: 
         helper.result()
 
 
+def redo(call: Callable, rows: np.ndarray, given: Any, found: Any, most: int) -> None:
+    """`call(*given, found)` once more for some rows, its answers written into `found`.
+
+    In blocks of two sizes, 16 and `most`, so that few are compiled. Trees of NumPy arrays, rows first.
+    """
+    size = 16 if len(rows) <= 16 else most
+    for first in range(0, len(rows), size):
+        these = rows[first : first + size]
+        filled = np.resize(these, size)
+        taken = jax.tree.map(lambda leaf, filled=filled: leaf[filled], (given, found))
+        answers = call(*taken[0], taken[1])
+        for whole, part in zip(jax.tree.leaves(found), jax.tree.leaves(answers), strict=True):
+            whole[these] = np.asarray(part)[: len(these)]
+
+
 def aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     """An array that JAX takes over without a copy."""
     size = math.prod(shape) * np.dtype(dtype).itemsize

@@ -123,7 +123,8 @@ def stage_of(stewart: Stewart) -> Stage:
     k = frame.coordinates
     apart = jnp.sum((feet - base[:LEGS, None]) ** 2, axis=-1)  # |S_j - A_i|^2
     sides = sum(k[:, a] * k[:, b] * side for (a, b), side in zip(PAIRS, frame.sides, strict=True))
-    squares = jnp.linalg.solve(quadratic := _quadratic_parts(free), jnp.eye(6, dtype=base.dtype))
+    quadratic = quadratic_parts(differences(free.reshape(3, 3, 3)))
+    squares = jnp.linalg.solve(quadratic, jnp.eye(6, dtype=base.dtype))
     return Stage(
         frame=frame,
         feet=feet,
@@ -148,10 +149,9 @@ def differences(vectors: jax.Array) -> jax.Array:
     return jnp.concatenate([vectors, jnp.stack([vectors[a] - vectors[b] for a, b in PAIRS])])
 
 
-def _quadratic_parts(free: jax.Array) -> jax.Array:
-    """Coefficients of y_a y_b, in the order of `PRODUCTS`, in the six quadrics. -> (6, 6)"""
-    g = differences(free.reshape(3, 3, 3))
-    gram = jnp.einsum("kia,kib->kab", g, g)
+def quadratic_parts(slopes: jax.Array) -> jax.Array:
+    """Coefficients of y_a y_b, in the order of `PRODUCTS`, in |c + G y|^2 of six G (6, 3, 3). -> (6, 6)"""
+    gram = jnp.einsum("kia,kib->kab", slopes, slopes)
     return jnp.stack([gram[:, a, b] * (1 if a == b else 2) for a, b in PRODUCTS], axis=1)
 
 

@@ -25,6 +25,7 @@ from pk_jax.kinematics.closed_form import candidates, closed_form, closed_form_o
 from pk_jax.kinematics.closure import pose_scale
 from pk_jax.kinematics.entrywise import entrywise
 from pk_jax.kinematics.forward import blanked
+from pk_jax.kinematics.in_blocks import redo
 from pk_jax.kinematics.lane_map import lane_map
 from pk_jax.kinematics.lanes import Entries, Lane, items_of
 from pk_jax.kinematics.length_errors import Judged, LengthErrors, judge, judge_on_lanes
@@ -260,14 +261,7 @@ def _known_rows(
         as_pose(t, r), as_pose(start_t, start_r), covariance, status, squared, residual, steps, sigma
     )
     lost = np.flatnonzero(status == Status.STALLED)
-    size = 16 if len(lost) <= 16 else 256
-    for first in range(0, len(lost), size):
-        these = lost[first : first + size]
-        padded = np.resize(these, size)
-        taken = jax.tree.map(lambda leaf, padded=padded: leaf[padded], (lengths, weights, found))
-        again = _persist_rows(stewart, stage, *taken)
-        for whole, part in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
-            whole[these] = np.asarray(part)[: len(these)]
+    redo(partial(_persist_rows, stewart, stage), lost, (lengths, weights), found, most=256)
     return _answer(stewart, found)
 
 

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pk_jax.kinematics.linear_stage import PRODUCTS, Stage, differences
+from pk_jax.kinematics.linear_stage import PRODUCTS, Stage, differences, quadratic_parts
 
 
 class Quadrics(NamedTuple):
@@ -124,10 +124,8 @@ def _determinant(*columns: tuple[jax.Array, jax.Array]) -> jax.Array:
 
 def _polynomials(quadrics: Quadrics) -> jax.Array:
     """Coefficients of the six quadrics, of 1, y, and the products. -> (6, 10)"""
-    gram = jnp.einsum("kia,kib->kab", quadrics.slopes, quadrics.slopes)
-    second = jnp.stack([gram[:, a, b] * (1 if a == b else 2) for a, b in PRODUCTS], axis=1)
     linear = linear_parts(quadrics)
-    return jnp.concatenate([linear[:, 3:], linear[:, :3], second], axis=1)
+    return jnp.concatenate([linear[:, 3:], linear[:, :3], quadratic_parts(quadrics.slopes)], axis=1)
 
 
 _MONOMIALS = [m for degree in range(4) for m in combinations_with_replacement(range(3), degree)]

@@ -1,13 +1,22 @@
 """Every test runs in float64; those about float32 say so themselves."""
 
+import atexit
 import os
+import shutil
+import tempfile
 
-import jax
-import pytest
-from hypothesis import HealthCheck, settings
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # what one worker or notebook compiled, the others take
+    _cache = tempfile.mkdtemp(prefix="pk_jax-tests-")
+    atexit.register(shutil.rmtree, _cache, ignore_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache  # the workers inherit it
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
 
-import pk_jax as pk
-from pk_jax.cli import main
+import jax  # noqa: E402
+import pytest  # noqa: E402
+from hypothesis import HealthCheck, settings  # noqa: E402
+
+import pk_jax as pk  # noqa: E402
+from pk_jax.cli import main  # noqa: E402
 
 pk.enable_x64()
 

@@ -11,12 +11,12 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # what one worker or notebook
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache  # the workers inherit it
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
 
-import jax  # noqa: E402
-import pytest  # noqa: E402
-from hypothesis import HealthCheck, settings  # noqa: E402
+import jax
+import pytest
+from hypothesis import HealthCheck, settings
 
-import pk_jax as pk  # noqa: E402
-from pk_jax.cli import main  # noqa: E402
+import pk_jax as pk
+from pk_jax.cli import main
 
 pk.enable_x64()
 

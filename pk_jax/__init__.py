@@ -58,6 +58,11 @@ if TYPE_CHECKING:
     from pk_jax.files.mechanism_file import save_mechanism as save_mechanism
     from pk_jax.geometry.axis_pose import AxisPose as AxisPose
     from pk_jax.geometry.se3 import SE3 as SE3
+    from pk_jax.kinematics.assembly import AssemblyModes as AssemblyModes
+    from pk_jax.kinematics.assembly import Fate as Fate
+    from pk_jax.kinematics.assembly import assembly_modes as assembly_modes
+    from pk_jax.kinematics.certify import Certified as Certified
+    from pk_jax.kinematics.certify import certify as certify
     from pk_jax.kinematics.forward import ForwardKinematics as ForwardKinematics
     from pk_jax.kinematics.forward import forward_kinematics as forward_kinematics
     from pk_jax.kinematics.inverse import InverseKinematics as InverseKinematics
@@ -72,6 +77,9 @@ if TYPE_CHECKING:
     from pk_jax.kinematics.nine_lengths import NineLengthPose as NineLengthPose
     from pk_jax.kinematics.nine_lengths import nine_length_candidates as nine_length_candidates
     from pk_jax.kinematics.nine_lengths import nine_length_pose as nine_length_pose
+    from pk_jax.kinematics.roadmap import Connections as Connections
+    from pk_jax.kinematics.roadmap import Link as Link
+    from pk_jax.kinematics.roadmap import connect_modes as connect_modes
     from pk_jax.kinematics.statics import BoundedForces as BoundedForces
     from pk_jax.kinematics.statics import Screws as Screws
     from pk_jax.kinematics.statics import bounded_joint_forces as bounded_joint_forces
@@ -182,6 +190,15 @@ _NAMES = {
     ),
     "pk_jax.geometry.axis_pose": ("AxisPose",),
     "pk_jax.geometry.se3": ("SE3",),
+    "pk_jax.kinematics.certify": (
+        "Certified",
+        "certify",
+    ),
+    "pk_jax.kinematics.assembly": (
+        "AssemblyModes",
+        "Fate",
+        "assembly_modes",
+    ),
     "pk_jax.kinematics.forward": (
         "ForwardKinematics",
         "forward_kinematics",
@@ -203,6 +220,11 @@ _NAMES = {
         "NineLengthPose",
         "nine_length_candidates",
         "nine_length_pose",
+    ),
+    "pk_jax.kinematics.roadmap": (
+        "Connections",
+        "Link",
+        "connect_modes",
     ),
     "pk_jax.kinematics.statics": (
         "BoundedForces",

@@ -331,9 +331,33 @@ def test_waves_of_wide_intervals_are_their_range(name):
 
 
 @pytest.mark.parametrize("name", WAVES)
-def test_waves_far_away_and_of_the_unknown(name):
-    """Beyond 7 rad all that is known is [-1, 1]; of what is not known, nothing."""
-    far = [(7.1, 7.2), (-1e300, -8), (-9, 9), (0, 1e9), (3, 7 + 1e-15)]
+def test_waves_far_away_hold_the_exact_value_closely(name):
+    """Whole turns are taken off, those of an interval that holds pi."""
+    rng = np.random.default_rng(3)
+    at = [*rng.uniform(-1e3, 1e3, 40), *(x for k in (-300, -7, 5, 8, 41) for x in beside(k * PI / 2))]
+    at += [math.nextafter(7.0, 8), 7.1, -9.0, 50.0]
+    for x, bounds in zip(at, all_bounds(name, at, at), strict=True):
+        less = Fraction(x) - round(Fraction(x) / (2 * PI)) * 2 * PI
+        assert is_in(name, less, bounds) and bounds[1] - bounds[0] < 1e-12
+        assert bounds[0] >= -1 and bounds[1] <= 1
+
+
+@pytest.mark.parametrize("name", WAVES)
+def test_wide_waves_far_away_are_their_range(name):
+    lower = np.random.default_rng(4).uniform(-200, 200, 100)
+    upper = lower + np.tile([0.1, 1, 3, 6], 25)
+    for low, high, bounds in zip(lower, upper, all_bounds(name, lower, upper), strict=True):
+        turns = [Fraction(x) / PI - Fraction(WAVES[name], 2) for x in (low, high)]
+        values = [(-1) ** k for k in range(math.ceil(turns[0]), math.floor(turns[1]) + 1)]
+        values += [wave(name, Fraction(x) - round(Fraction(x) / (2 * PI)) * 2 * PI)[0] for x in (low, high)]
+        assert bounds[0] <= min(values) < bounds[0] + 1e-11
+        assert bounds[1] - 1e-11 < max(values) <= bounds[1]
+
+
+@pytest.mark.parametrize("name", WAVES)
+def test_waves_very_far_away_and_of_the_unknown(name):
+    """Where turns cannot be told, or there are several, all that is known is [-1, 1]; of NaN, nothing."""
+    far = [(1e18, 1e18), (-1e300, -8), (-9, 9), (0, 1e9), (-GREATEST, GREATEST), (9, INF)]
     assert all_bounds(name, *zip(*far, strict=True)) == [(-1, 1)] * len(far)
     unknown = [(NAN, NAN), (NAN, 1), (0, NAN), (-9, NAN)]
     assert np.isnan(all_bounds(name, *zip(*unknown, strict=True))).all()

@@ -24,6 +24,8 @@ from pk_jax.kinematics.batching import (
     where,
     without_derivatives,
 )
+from pk_jax.kinematics.certify import certify as prove
+from pk_jax.kinematics.certify import check_known
 from pk_jax.kinematics.closure import pose_scale
 from pk_jax.kinematics.in_blocks import redo
 from pk_jax.kinematics.lane_newton import Home
@@ -45,13 +47,18 @@ class ForwardKinematics(NamedTuple):
     sigma_min: jax.Array  # () lower bound of the least singular value of A without units
     det_sign: jax.Array  # () sign of det A over its sign at home; 0 where actuation is redundant
     candidate: Any  # the last iterate, whatever the status
+    is_certified: Any = None  # () where it was asked for: what `certify` proves of the pose,
+    radius: Any = None  # () m, and how far the exact solution is from it at most
 
 
-def forward_kinematics(mech: Mechanism, joints: Any, guess: Any = None) -> ForwardKinematics:
+def forward_kinematics(
+    mech: Mechanism, joints: Any, guess: Any = None, *, certify: bool = False
+) -> ForwardKinematics:
     """The pose for given joints, by damped Newton from `guess` (default: home).
 
     joints:  (m,) or (batch, m)
     guess:   one pose for all rows, or one a row
+    certify: prove of every pose that a solution is near, as `pk_jax.certify` does (known values in float64)
 
     Status: OK: closed to roundoff; OTHER_MODE: closed, but det A has another sign than at the
     start; SINGULAR: closed on a type II singularity; UNREACHABLE: the mechanism's closed form says
@@ -68,6 +75,11 @@ def forward_kinematics(mech: Mechanism, joints: Any, guess: Any = None) -> Forwa
     function theorem; zero on rows that are not OK.
     """
     require_mechanism("forward_kinematics", mech)
+    if certify:
+        check_known("forward_kinematics with certify=True", mech, joints, guess)
+        found = forward_kinematics(mech, joints, guess)
+        proved = prove(mech, found.pose, joints)
+        return found._replace(is_certified=proved.is_certified, radius=proved.radius)
     if checks.is_concrete((mech, joints, guess)) and (found := _known(mech, joints, guess)) is not None:
         return found
     home_pose, home_joints = home_shapes(mech)
@@ -272,6 +284,16 @@ def _again(
 @jax.jit
 def _persist_rows(mech, home, joints, guess, found):
     return jax.vmap(partial(_persist, mech, home))(joints, guess, found)
+
+
+def solved_from(mech: Mechanism, joints: np.ndarray, guess: Any) -> ForwardKinematics:
+    """Rows (batch, m) from a guess each, by Levenberg-Marquardt alone: one program for all mechanisms alike.
+
+    `forward_kinematics` is faster but compiles lanes for the mechanism's own pivots.
+    """
+    home = rows.prepared(mech)[0]
+    untried = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(joints), *leaf.shape)), _untried(home))
+    return _persist_rows(mech, home, joints, guess, untried)
 
 
 def blanked(tree: Any, rows: np.ndarray) -> Any:

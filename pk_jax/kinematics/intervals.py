@@ -211,9 +211,10 @@ def _exact(operation: Callable, a: Item, b: Item) -> float | None:
 
 # --- sine and cosine
 
-_LARGEST = 7.0  # rad; beyond it [-1, 1]
+_LARGEST = 7.0  # rad; what is beyond it, and stays there when whole turns are taken off, has [-1, 1]
 _TERMS = 24  # of the series: 7^48 / 48! < 1e-20
 _PI = Interval(np.float64(3.141592653589793), np.float64(3.1415926535897936))
+_TURN = Interval(2 * _PI.lower, 2 * _PI.upper)
 
 
 def cosine(a: Item) -> Item:
@@ -226,7 +227,7 @@ def sine(a: Item) -> Item:
 
 def _wave(a: Item, shift: float) -> Interval:
     """cos(a - shift pi): the hull of both ends, and +-1 where an extreme may lie between them."""
-    a = as_interval(a)
+    a = _turned_back(as_interval(a))
     series = _sine_of if shift else _cosine_of
     ends = [as_interval(series(Interval(end, end))) for end in (a.lower, a.upper)]
     least = np.minimum(ends[0].lower, ends[1].lower)
@@ -237,10 +238,23 @@ def _wave(a: Item, shift: float) -> Interval:
     is_even = np.mod(first, 2) == 0
     has_top = (count >= 1) | ((count == 0) & is_even)
     has_bottom = (count >= 1) | ((count == 0) & ~is_even)
-    is_far = ~(np.maximum(np.abs(a.lower), np.abs(a.upper)) <= _LARGEST)
+    is_far = ~_is_near(a)
     unknown = np.where(np.isnan(a.lower + a.upper), np.nan, 0.0)
     lower = np.where(has_bottom | is_far, -1.0, np.maximum(least, -1.0)) + unknown
     return Interval(lower, np.where(has_top | is_far, 1.0, np.minimum(greatest, 1.0)) + unknown)
+
+
+def _turned_back(a: Interval) -> Interval:
+    """Angles less whole turns, where that brings them near zero."""
+    if np.all(_is_near(a)):
+        return a
+    less = minus(a, times(_TURN, thin(np.rint(a.middle / _TURN.lower))))
+    is_better = _is_near(less) & ~_is_near(a)
+    return Interval(np.where(is_better, less.lower, a.lower), np.where(is_better, less.upper, a.upper))
+
+
+def _is_near(a: Interval) -> np.ndarray:
+    return np.maximum(np.abs(a.lower), np.abs(a.upper)) <= _LARGEST
 
 
 def _cosine_of(x: Interval) -> Interval:

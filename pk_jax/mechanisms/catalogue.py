@@ -79,6 +79,26 @@ def _calibration_nominal() -> Stewart:
     return Stewart(base=mirrored(base), platform=mirrored(platform))
 
 
+def _dietmaier() -> Stewart:
+    base = [
+        [0, 0, 0],
+        [1.107915, 0, 0],
+        [0.549094, 0.756063, 0],
+        [0.735077, -0.223935, 0.525991],
+        [0.514188, -0.526063, -0.368418],
+        [0.590473, 0.094733, -0.205018],
+    ]
+    platform = [
+        [0, 0, 0],
+        [0.542805, 0, 0],
+        [0.956919, -0.528915, 0],
+        [0.665885, -0.353482, 1.402538],
+        [0.478359, 1.158742, 0.107672],
+        [-0.137087, -0.235121, 0.353913],
+    ]
+    return Stewart(base=base, platform=platform)
+
+
 def _sauer_3_rpr() -> PlanarRPR:
     return PlanarRPR(base=[[0, 0], [5, 0], [0, 6]], platform=[[0, 0], [3, 0], [3, 3]])
 
@@ -144,6 +164,11 @@ CATALOGUE: dict[str, Entry] = {
         _calibration_nominal,
         "hexapod machine tool, nominal geometry of the 42-parameter calibration benchmark "
         "(Masory, Wang and Zhuang)",
+    ),
+    "dietmaier-40": Entry(
+        _dietmaier,
+        "Dietmaier 1998, The Stewart-Gough platform of general geometry can have 40 real postures, Advances "
+        "in Robot Kinematics: at lengths 1, 0.645275, 1.086284, 1.503439, 1.281933, 0.771071; no unit",
     ),
     "5-link": Entry(
         lambda: FiveBar(half_base=0.1, proximal=0.2, distal=0.25), f"{_EXAMPLE} 5-link; lengths in m"

@@ -2,8 +2,8 @@
 
     make bench        or        python -m benchmarks.assembly_modes [--quick]
 
-One process pinned to one core, compile time apart. The peers start from random poses and cannot know when they
-have found every mode: here they are told the number, and stop there or when 60 times our time is spent.
+One process pinned to one core, compile time apart. The peers start from random poses and cannot know when
+they have found every mode: here they are told the number, and stop there or when 60 times our time is spent.
 """
 
 from __future__ import annotations

@@ -327,6 +327,21 @@ def test_modes_of_a_five_bar_mirror_each_other_in_the_line_of_its_elbows():
     assert sorted(np.asarray(modes.det_sign).tolist()) == [-1, 1]
 
 
+class Boastful(pk.PlanarRPR):
+    """Says of a pose that is off that it closes the legs."""
+
+    def forward(self, joints):
+        poses, is_real = super().forward(joints)
+        return poses + jnp.asarray([0.02, 0, 0]), is_real
+
+
+def test_a_closed_form_is_not_believed_where_it_does_not_close():
+    mech = Boastful(base=[[0, 0], [5, 0], [0, 6]], platform=[[0, 0], [3, 0], [3, 3]])
+    modes = pk.assembly_modes(mech, [5, 5, 3])
+    assert modes.count == 0 and modes.tally()["LOST"] == 4
+    assert not modes.is_complete and modes.status == Status.INCOMPLETE
+
+
 # --- any other mechanism: a search, never called complete
 
 
@@ -380,6 +395,14 @@ def test_a_batch_is_a_loop_and_bad_rows_hurt_no_other():
         for alone, among in zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True):
             if not isinstance(alone, str):
                 np.testing.assert_array_equal(alone, among[k])
+
+
+def test_solutions_near_infinity_are_told_from_those_at_infinity():
+    """A real hexapod is nearly symmetric: eight of twelve solutions have |x . x| / |z|^2 above 1e-12."""
+    log = catalogued("hexapod-log")
+    assert pk.assembly_modes(log, log.home()[1]).expected == 36
+    exact = catalogued("calibration-hexapod")
+    assert pk.assembly_modes(exact, exact.home()[1]).expected == 28
 
 
 def test_every_entry_of_the_catalogue_has_its_home_among_its_modes():

@@ -233,6 +233,19 @@ def test_a_path_that_jumped_is_noticed_and_its_conjugate_may_stand_in(general, m
     assert len(found.regular) == SOLUTIONS and found.is_complete
 
 
+def test_conjugates_of_complex_solutions_stand_in_for_lost_paths(general, meddled):
+    calls = meddled(lambda call, paths: lost(paths, 3) if call == 1 else paths)
+    found = general.solve(LENGTHS)
+    assert len(found.regular) == SOLUTIONS and found.is_complete and found.retries == 0 and len(calls) == 2
+
+
+def test_a_path_that_ends_alone_on_a_singular_solution_was_misled(general, meddled):
+    misled = lambda paths: paths._replace(end=np.where(np.arange(SOLUTIONS) == 0, End.SINGULAR, paths.end))
+    meddled(lambda call, paths: misled(paths) if call == 1 else paths)
+    found = general.solve(LENGTHS)
+    assert len(found.regular) == SOLUTIONS and found.is_complete and not found.met
+
+
 def test_what_stays_lost_is_said(general, meddled):
     general.count()
     meddled(lambda call, paths: lost(paths, 30))

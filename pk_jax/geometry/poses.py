@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from pk_jax.geometry.axis_pose import AxisPose
 from pk_jax.geometry.planar import cross, direction, rotation, turn_onto
@@ -90,6 +91,21 @@ def difference(pose: Pose, other: Pose) -> jax.Array:
         axial = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
         return jnp.concatenate([position(other) - position(pose), 2 * axial / (1 + jnp.trace(turn))])
     return other - pose
+
+
+def features(poses: Pose, declared: tuple[int, ...] | None, length: float) -> np.ndarray:
+    """Known poses, batch first, as points (k, f) whose distances are those of the poses, without units.
+
+    Of positions over `length`, and of turns by their chords, so that a full turn is none. `declared` as
+    for `pose_units`.
+    """
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(poses)]
+    if isinstance(poses, Turning):
+        shift, rotation = (leaf.reshape(len(leaf), -1) for leaf in leaves)
+        return np.concatenate([shift / length, rotation / np.sqrt(2)], axis=1)
+    units = (1,) * leaves[0].shape[1] if declared is None else declared
+    angles, shifts = (leaves[0][:, np.equal(units, unit)] for unit in (0, 1))
+    return np.concatenate([shifts / length, np.cos(angles), np.sin(angles)], axis=1)
 
 
 def tangent_size(pose: Pose) -> int:

@@ -1,4 +1,4 @@
-"""Points spread evenly over a box, the same every time."""
+"""Points spread evenly over a box, or over all rotations, the same every time."""
 
 from __future__ import annotations
 
@@ -15,3 +15,13 @@ def evenly(count: int, dimension: int) -> np.ndarray:
         root = (1 + root) ** (1 / (dimension + 1))
     steps = root ** -np.arange(1.0, dimension + 1)
     return (0.5 + np.arange(count)[:, None] * steps) % 1
+
+
+def quaternions(spread: np.ndarray) -> np.ndarray:
+    """Points of [0, 1)^3, (k, 3), as unit quaternions of equal measure. -> (k, 4)
+
+    Source: Shoemake 1992, Graphics Gems III, 124-132.
+    """
+    u, v, w = spread[:, 0], 2 * np.pi * spread[:, 1], 2 * np.pi * spread[:, 2]
+    circles = np.stack([np.sin(v), np.cos(v), np.sin(w), np.cos(w)], axis=1)
+    return circles * np.sqrt(np.stack([1 - u, 1 - u, u, u], axis=1))

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pk_jax.geometry import rotations
-from pk_jax.geometry.poses import Turning, like, place, pose_units, tangent_size
+from pk_jax.geometry.poses import Turning, features, like, place, pose_units, tangent_size
 from pk_jax.geometry.se3 import SE3
-from pk_jax.geometry.spread import evenly
+from pk_jax.geometry.spread import evenly, quaternions
 from pk_jax.kinematics.batching import home_shapes, is_possible, rows_of
 from pk_jax.kinematics.certify import certify, check_known
 from pk_jax.kinematics.closure import pose_scale
@@ -213,12 +213,9 @@ def _starts(mech: Mechanism) -> Any:
     spread = evenly(STARTS, n)
     if isinstance(home, Turning):
         shift = jax.tree.leaves(home)[0]
-        u, v, w = spread[:, n - 3 :].T  # quaternions spread evenly: Shoemake 1992
-        angles = 2 * np.pi * v, 2 * np.pi * w
-        parts = np.sin(angles[0]), np.cos(angles[0]), np.sin(angles[1]), np.cos(angles[1])
-        quaternions = np.stack(parts, axis=1) * np.sqrt(np.stack([1 - u, 1 - u, u, u], axis=1))
+        turned = np.asarray(jax.vmap(rotations.from_quaternion)(quaternions(spread[:, n - 3 :])))
         moved = shift + ((4 * spread[:, : n - 3] - 2) * scale[: n - 3]).reshape(STARTS, *shift.shape)
-        return like(home, moved, np.asarray(jax.vmap(rotations.from_quaternion)(quaternions)))
+        return like(home, moved, turned)
     reach = np.where(np.asarray(pose_units(home, mech.pose_units)) > 0, 2 * scale, np.pi)
     return home + (2 * spread - 1) * reach
 
@@ -254,20 +251,8 @@ def _certified(mech: Mechanism, poses: Any, joints: np.ndarray) -> tuple[np.ndar
 
 def _apart(mech: Mechanism, poses: Any, others: Any) -> np.ndarray:
     """Distances without units: of positions over length(), and of turns. -> (k, l)"""
-    here, there = _features(mech, poses), _features(mech, others)
+    here, there = (features(each, mech.pose_units, float(mech.length())) for each in (poses, others))
     return np.linalg.norm(here[:, None] - there[None], axis=2)
-
-
-def _features(mech: Mechanism, poses: Any) -> np.ndarray:
-    """Poses as points (k, f); those near each other are near, also across a full turn."""
-    length = float(mech.length())
-    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(poses)]
-    if isinstance(poses, Turning):
-        shift, rotation = (leaf.reshape(len(leaf), -1) for leaf in leaves)
-        return np.concatenate([shift / length, rotation / np.sqrt(2)], axis=1)
-    is_length = np.asarray(pose_units(leaves[0][0] if len(leaves[0]) else leaves[0].T, mech.pose_units)) > 0
-    angles = leaves[0][:, ~is_length]
-    return np.concatenate([leaves[0][:, is_length] / length, np.cos(angles), np.sin(angles)], axis=1)
 
 
 def _mirrors(mech: Mechanism, joints: np.ndarray, poses: Any, is_real: np.ndarray) -> np.ndarray:
@@ -284,8 +269,7 @@ def _mirrors(mech: Mechanism, joints: np.ndarray, poses: Any, is_real: np.ndarra
     middle = np.mean(centres[0], axis=0)
     extents, axes = np.linalg.svd(centres[0] - middle)[1:]
     small = SAME_TO * float(mech.length())
-    are_fixed = np.ptp(centres, axis=0).max() < small
-    if not are_fixed or len(centres[0]) < len(axes) or extents[-1] > small:
+    if len(centres[0]) < len(axes) or extents[-1] > small:
         return images
     height = (points - middle) @ axes[-1]
     reflected = points - 2 * height[..., None] * axes[-1]

@@ -69,6 +69,18 @@ def test_fk_of_measured_rows(run, here):
     assert run("fk", HEXAPOD, "l.csv", "--strict")[0] == 3
 
 
+def test_fk_certifies_on_request_in_the_unit_of_the_file(run, here):
+    (here / "l.csv").write_text(f"l1_mm,l2_mm,l3_mm,l4_mm,l5_mm,l6_mm\n{ROW}\nnan{ROW[7:]}\n")
+    found = table(run("fk", HEXAPOD, "l.csv", "--certify")[1])
+    proved = pk.forward_kinematics(
+        pk.load_mechanism(HEXAPOD), np.array(ROW.split(","), float) / 1000, certify=True
+    )
+    assert list(found)[-1] == "certified_within" and np.isnan(found["certified_within"][1])
+    np.testing.assert_allclose(found["certified_within"][0], 1000 * float(proved.radius), rtol=0.3)
+    assert 0 < found["certified_within"][0] < 1e-9
+    assert run("fk", "nine-lengths", "l.csv", "--certify", "--closed-form")[0] == 2
+
+
 @pytest.mark.parametrize("names", ["qw,qx,qy,qz", "rx,ry,rz", "both"])
 def test_fk_of_ik_is_the_identity_in_space(run, here, names):
     rng = np.random.default_rng(5)

@@ -18,15 +18,18 @@ def add_forward(command: Command) -> None:
         "--closed-form", action="store_true", help="of nine lengths: no guess, then weighted least squares"
     )
     sub.add_argument("--sigma", metavar="LEG,SENSOR", help="with it: standard deviations of the lengths")
+    sub.add_argument("--certify", action="store_true", help="prove how near each pose is to the exact one")
     _takes_chunk(sub)
 
 
 def _forward(options: argparse.Namespace) -> int:
     if options.sigma and not options.closed_form:
         raise ValueError("--sigma is for --closed-form")
+    if options.closed_form and options.certify:
+        raise ValueError("--certify is not for --closed-form")
     if options.closed_form:
         return _convert(options, "nine_length_rows", sigma=options.sigma)
-    return _convert(options, "forward_rows")
+    return _convert(options, "forward_rows", certify=options.certify)
 
 
 def add_inverse(command: Command) -> None:
@@ -57,7 +60,7 @@ def _takes_chunk(sub: argparse.ArgumentParser) -> None:
     )
 
 
-def _convert(options: argparse.Namespace, function: str, **more: str | None) -> int:
+def _convert(options: argparse.Namespace, function: str, **more: str | bool | None) -> int:
     progress = begin()
     from pk_jax.files import stream
     from pk_jax.files.named import named_mechanism

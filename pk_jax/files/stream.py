@@ -40,11 +40,17 @@ _PLACE = {SE3: 3, AxisPose: 1}  # columns before the turn
 _KINDS = ("angle", "length")
 
 
-def forward_rows(named: Named, source: str, target: str | None, **options: Any) -> Counter[str]:
-    """Poses of the joints in `source`, written to `target`; see `_stream`."""
+def forward_rows(
+    named: Named, source: str, target: str | None, *, certify: bool = False, **options: Any
+) -> Counter[str]:
+    """Poses of the joints in `source`, written to `target`; see `_stream`.
+
+    certify:  prove of each pose how near the exact one is: a column more, NaN where that is not proved
+    """
     header = [c.name for c in output_layout(named)]
     header += ["status", "residual", "steps", "sigma_min", "det_sign"]
-    solve = partial(_forward, named, _Padding())
+    header += ["certified_within"] if certify else []
+    solve = partial(_forward, named, _Padding(), certify)
     return _stream(named, source, target, joint_layouts(named), header, solve, **options)
 
 
@@ -247,13 +253,16 @@ def joints_columns(named: Named, joints: Any) -> list[np.ndarray]:
     return [*np.asarray(joints).T / scale_of(named, joint_layouts(named)[0])[:, None]]
 
 
-def _forward(named: Named, pad: _Padding, layout: Layout, rows: np.ndarray) -> tuple[list[Any], np.ndarray]:
-    found = forward_kinematics(named.mechanism, rows * scale_of(named, layout))
+def _forward(
+    named: Named, pad: _Padding, certify: bool, layout: Layout, rows: np.ndarray
+) -> tuple[list[Any], np.ndarray]:
+    found = forward_kinematics(named.mechanism, rows * scale_of(named, layout), certify=certify)
     poses = jax.tree.map(lambda leaf: pad(np.asarray(leaf)), found.pose)
     numbers = [column[: len(rows)] for column in pose_columns(named, poses)]
     status, residual, steps, sigma, signs = (np.asarray(each) for each in found[1:6])
     signs = [f"{sign:.0f}" for sign in signs.tolist()]
-    return [*numbers, _names(status), residual, steps, sigma, signs], status
+    proved = [np.asarray(found.radius) / named.metres] if certify else []
+    return [*numbers, _names(status), residual, steps, sigma, signs, *proved], status
 
 
 def _nine_lengths(

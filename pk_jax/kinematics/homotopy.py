@@ -14,10 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+RUNGE_KUTTA = (0, 1 / 2, 1 / 2, 1), (1 / 6, 1 / 3, 1 / 3, 1 / 6)  # of fourth order: shares of a step, weights
 FIRST_STEP = 0.05
 CLOSE = 1e-4  # |first Newton correction| that steps aim at, z being of unit length
 ENDED = 1e-9  # |last Newton correction| of an accepted step
 STEPS = 1500
+TOGETHER = (16,)  # paths that are left when they go on by themselves: all in one loop wait for the slowest
 SINGULAR_BEFORE = 1e-10  # a path that still runs here ends on a singular solution
 NEAR_END = 1e-2  # before it nothing is said of a path
 INFINITY, START_OF_INFINITY = 1e-12, 1e-3  # |z . M z| of a point at infinity, and where paths there may begin
@@ -88,6 +90,13 @@ def follow(pencil: Pencil, infinity: jax.Array, starts: jax.Array, is_wanted: ja
         fill(0.0),
         fill(0, jnp.int32),
     )
+    paths = _advanced(pencil, infinity, paths, (*(few for few in TOGETHER if few < count), 0))
+    end = jnp.where(is_wanted & (paths.end == End.RUNNING), End.LOST, paths.end)
+    return paths._replace(end=jnp.where(is_wanted, end, End.RUNNING))
+
+
+def _advanced(pencil: Pencil, infinity: jax.Array, paths: Paths, until: tuple[int, ...]) -> Paths:
+    """Paths run in lockstep until no more than so many are left, which then run by themselves."""
     is_running = lambda paths: (paths.end == End.RUNNING) & (paths.steps < STEPS)
 
     def advance(paths):
@@ -97,9 +106,15 @@ def follow(pencil: Pencil, infinity: jax.Array, starts: jax.Array, is_wanted: ja
         runs = is_running(paths)
         return jax.tree.map(chosen, jax.vmap(lambda path: _step(pencil, infinity, path))(paths), paths)
 
-    paths = lax.while_loop(lambda paths: jnp.any(is_running(paths)), advance, paths)
-    end = jnp.where(is_wanted & (paths.end == End.RUNNING), End.LOST, paths.end)
-    return paths._replace(end=jnp.where(is_wanted, end, End.RUNNING))
+    few, *fewer = until
+    paths = lax.while_loop(lambda paths: jnp.sum(is_running(paths)) > few, advance, paths)
+    if not few:
+        return paths
+    count = len(paths.end)
+    left = jnp.nonzero(is_running(paths), size=few, fill_value=count)[0]
+    others = jax.tree.map(lambda leaf: leaf.at[left].get(mode="fill", fill_value=End.LOST), paths)
+    others = _advanced(pencil, infinity, others, tuple(fewer))
+    return jax.tree.map(lambda leaf, part: leaf.at[left].set(part, mode="drop"), paths, others)
 
 
 def _step(pencil: Pencil, infinity: jax.Array, path: Paths) -> Paths:
@@ -118,29 +133,27 @@ def _step(pencil: Pencil, infinity: jax.Array, path: Paths) -> Paths:
             jnp.append((slopes @ z) @ z, 0),
         )
 
-    def velocity(z, s):
-        jacobian, _, slope = system(z, s)
-        return -jnp.linalg.solve(jacobian, slope)
+    def stage(velocity, share):
+        jacobian, _, slope = system(z + share * h * velocity, s + share * h)
+        velocity = -jnp.linalg.solve(jacobian, slope)
+        return velocity, velocity
 
-    k1 = velocity(z, s)
-    k2 = velocity(z + h / 2 * k1, s + h / 2)
-    k3 = velocity(z + h / 2 * k2, s + h / 2)
-    k4 = velocity(z + h * k3, s + h)
-    ahead = jnp.where(step == s, 0, s + h)
-    point, corrections = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), []
-    for _ in range(3):
+    def correct(point, _):
         jacobian, value, _ = system(point, ahead)
         correction = jnp.linalg.solve(jacobian, value)
-        point = point - correction
-        corrections.append(_length(correction))
-    first, second, third = corrections
+        return point - correction, _length(correction)
+
+    ahead = jnp.where(step == s, 0, s + h)
+    shares, weights = (jnp.asarray(each, s.dtype) for each in RUNGE_KUTTA)
+    velocities = lax.scan(stage, jnp.zeros_like(z), shares)[1]
+    point, (first, second, third) = lax.scan(correct, z + h * weights @ velocities, length=3)
     is_good = (first < 10 * CLOSE) & (second < 0.1 * first + ENDED) & (third < 10 * ENDED)
     is_good &= jnp.all(jnp.isfinite(point))
     factor = jnp.clip(0.9 * (CLOSE / jnp.clip(first, 1e-16, 1)) ** 0.2, 0.15, 4)  # NaN: below
     longer = jnp.where(is_good, factor, jnp.where(factor < 0.5, factor, 0.5))
 
     # how z . M z vanishes, and how much of it would be left at s = 0 if it goes with a whole power of s
-    norm, rate = z @ infinity @ z, 2 * (z @ infinity @ k1)
+    norm, rate = z @ infinity @ z, 2 * (z @ infinity @ velocities[0])
     size = jnp.abs(norm)
     valuation = jnp.real(s * rate / norm)
     power = jnp.maximum(jnp.round(valuation), 1)

@@ -17,7 +17,7 @@ from pk_jax.viz.style import BLUE, GREEN, INK, SOFT, VERMILION, new_figure
 
 VIEW = (22.0, -72.0)  # elevation and azimuth, degrees
 MOST_LARGE = 8  # panels
-HEAD, FOOT = 0.2, 0.35  # above each panel, of its side; below all, inches
+HEAD, FOOT = 0.3, 0.35  # above each panel, of its side; below all, inches
 FILLED = 1.55  # zoom at which a cube's width is nearly that of its axes
 _COLORS = {1: BLUE, -1: VERMILION, 0: GREEN}
 _SIGNS = {1: "+", -1: "\N{MINUS SIGN}", 0: "0"}

@@ -58,9 +58,6 @@ if TYPE_CHECKING:
     from pk_jax.files.mechanism_file import save_mechanism as save_mechanism
     from pk_jax.geometry.axis_pose import AxisPose as AxisPose
     from pk_jax.geometry.se3 import SE3 as SE3
-    from pk_jax.kinematics.assembly import AssemblyModes as AssemblyModes
-    from pk_jax.kinematics.assembly import Fate as Fate
-    from pk_jax.kinematics.assembly import assembly_modes as assembly_modes
     from pk_jax.kinematics.certify import Certified as Certified
     from pk_jax.kinematics.certify import certify as certify
     from pk_jax.kinematics.forward import ForwardKinematics as ForwardKinematics
@@ -73,13 +70,16 @@ if TYPE_CHECKING:
     from pk_jax.kinematics.jacobian import self_motions as self_motions
     from pk_jax.kinematics.jacobian import velocity_jacobian as velocity_jacobian
     from pk_jax.kinematics.laws import check_mechanism as check_mechanism
+    from pk_jax.kinematics.modes.assembly import AssemblyModes as AssemblyModes
+    from pk_jax.kinematics.modes.assembly import Fate as Fate
+    from pk_jax.kinematics.modes.assembly import assembly_modes as assembly_modes
+    from pk_jax.kinematics.modes.roadmap import Connections as Connections
+    from pk_jax.kinematics.modes.roadmap import Link as Link
+    from pk_jax.kinematics.modes.roadmap import connect_modes as connect_modes
     from pk_jax.kinematics.nine_lengths import NineLengthCandidates as NineLengthCandidates
     from pk_jax.kinematics.nine_lengths import NineLengthPose as NineLengthPose
     from pk_jax.kinematics.nine_lengths import nine_length_candidates as nine_length_candidates
     from pk_jax.kinematics.nine_lengths import nine_length_pose as nine_length_pose
-    from pk_jax.kinematics.roadmap import Connections as Connections
-    from pk_jax.kinematics.roadmap import Link as Link
-    from pk_jax.kinematics.roadmap import connect_modes as connect_modes
     from pk_jax.kinematics.statics import BoundedForces as BoundedForces
     from pk_jax.kinematics.statics import Screws as Screws
     from pk_jax.kinematics.statics import bounded_joint_forces as bounded_joint_forces
@@ -194,7 +194,7 @@ _NAMES = {
         "Certified",
         "certify",
     ),
-    "pk_jax.kinematics.assembly": (
+    "pk_jax.kinematics.modes.assembly": (
         "AssemblyModes",
         "Fate",
         "assembly_modes",
@@ -221,7 +221,7 @@ _NAMES = {
         "nine_length_candidates",
         "nine_length_pose",
     ),
-    "pk_jax.kinematics.roadmap": (
+    "pk_jax.kinematics.modes.roadmap": (
         "Connections",
         "Link",
         "connect_modes",

@@ -1,15 +1,6 @@
 """Every test runs in float64; those about float32 say so themselves."""
 
-import atexit
 import os
-import shutil
-import tempfile
-
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # what one worker or notebook compiled, the others take
-    _cache = tempfile.mkdtemp(prefix="pk_jax-tests-")
-    atexit.register(shutil.rmtree, _cache, ignore_errors=True)
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache  # the workers inherit it
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
 
 import jax
 import pytest

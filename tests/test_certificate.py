@@ -100,6 +100,7 @@ def paper_confined():
     return pk.certify_confined(OSCILLATOR, POSES, within=STROKES)
 
 
+@pytest.mark.soak  # `pk-jax reproduce casing-oscillator` proves it, too
 def test_the_box_of_the_paper_is_regular():
     found = paper_regular()
     assert found.is_proved and found.bound > 0.5 and len(found.unsettled[0]) == 0

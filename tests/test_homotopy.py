@@ -11,11 +11,12 @@ import pytest
 
 import pk_jax as pk
 from pk_jax.geometry import rotations
-from pk_jax.kinematics import monodromy, stewart_modes
-from pk_jax.kinematics.homotopy import End, Pencil, apart, follow
-from pk_jax.kinematics.monodromy import SOLUTIONS, between, generic_start, random_legs
-from pk_jax.kinematics.stewart_modes import Layout
-from pk_jax.kinematics.study import NORM, PRODUCT, Legs, motion_of, point_of, quadrics
+from pk_jax.kinematics.modes import monodromy
+from pk_jax.kinematics.modes import stewart as stewart_modes
+from pk_jax.kinematics.modes.homotopy import End, Pencil, apart, follow
+from pk_jax.kinematics.modes.monodromy import SOLUTIONS, between, generic_start, random_legs
+from pk_jax.kinematics.modes.stewart import Layout
+from pk_jax.kinematics.modes.study import NORM, PRODUCT, Legs, motion_of, point_of, quadrics
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 

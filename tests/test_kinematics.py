@@ -376,6 +376,7 @@ def test_second_derivatives_of_forward_kinematics(name):
         np.testing.assert_allclose(reverse, exact, rtol=0, atol=1e-12 * size)
 
 
+@pytest.mark.soak
 def test_second_derivatives_of_newtons_inverse():
     rate = jax.jit(jax.jacfwd(lambda x: pk.inverse_kinematics(DELTA, x).joints))
     pose = np.array([0.05, 0.02, -0.6])

@@ -181,6 +181,7 @@ def test_five_bar_obeys_the_laws(name):
     is_lawful(FIVE[name], five(name))
 
 
+@pytest.mark.soak  # notebook 03 draws them
 @pytest.mark.parametrize("name", FIVE)
 @pytest.mark.parametrize("leg", [0, 1])
 @pytest.mark.parametrize("sign", [1, -1])
@@ -305,6 +306,7 @@ def compare_with_sign_changes(mech, found, mode=None, nodes=140):
     return changes, crossings
 
 
+@pytest.mark.soak  # a good deal to compile; notebook 03 draws it
 @pytest.mark.parametrize("phi", [0.0, 0.4])
 @pytest.mark.parametrize("name", RRR)
 def test_type_two_of_the_3_rrr_is_where_the_determinant_changes_sign(name, phi):

@@ -87,7 +87,10 @@ SLOW = {
     "4-rrr",
     "5-link",
     "5-link, coaxial",
-}  # to compile; other arms and legs obey the same code
+    "sauer-3-rpr",
+    "arte-3-rpr",
+    "3-rpr, irregular",
+}  # to compile; other arms and legs obey the same code, and an outsider's 3-RPR in test_laws
 
 
 @pytest.mark.parametrize(
@@ -442,6 +445,7 @@ def along(t, p2):
     return pk.PlanarRPR(base=base, platform=platform).forward(lengths)[0]
 
 
+@pytest.mark.soak
 def test_derivatives_of_modes_through_third_order():
     """Each order against central differences, of fourth order, of the one before."""
     orders = [along]

@@ -11,7 +11,7 @@ from jax import lax
 from refusals import said_by
 
 import pk_jax as pk
-from pk_jax.kinematics import roadmap
+from pk_jax.kinematics.modes import roadmap
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 

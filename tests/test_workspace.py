@@ -272,6 +272,7 @@ def test_gradient_of_a_mechanism_is_a_mechanism():
     )
 
 
+@pytest.mark.soak
 def test_reverse_equals_forward_mode():
     value = lambda z: pk.workspace_indices(SPACE.mechanism(z)).gii
     z = jnp.array([2.3, 0.4])

@@ -408,6 +408,7 @@ def resolved(by, seed=1, wide=0.15, mech=CASING):
     return pose, pk.resolve_redundancy(mech, pose, by=by)
 
 
+@pytest.mark.soak
 def test_the_carriage_with_the_most_margin_is_that_of_a_scan():
     """The value always, and the carriage where it is but one: legs 2 and 3 do not see it."""
     pose, found = resolved("margin")

@@ -14,9 +14,9 @@ from pk_jax.files.columns import Layout
 from pk_jax.files.named import Named
 from pk_jax.files.rows_file import format_rows, open_rows, parse_row
 from pk_jax.files.stream import joint_layouts, joints_columns, output_layout, pose_columns, scale_of
-from pk_jax.kinematics.assembly import STARTS, AssemblyModes, Fate, assembly_modes
 from pk_jax.kinematics.batching import is_possible
-from pk_jax.kinematics.roadmap import Link, connect_modes
+from pk_jax.kinematics.modes.assembly import STARTS, AssemblyModes, Fate, assembly_modes
+from pk_jax.kinematics.modes.roadmap import Link, connect_modes
 from pk_jax.status import Status
 
 TO_HOME = {Link.PATH: "path", Link.IMPOSSIBLE: "no: det changes sign", Link.NOT_FOUND: "not found"}
@@ -110,6 +110,8 @@ def because(modes: AssemblyModes) -> str:
     """Whether these are all modes, and why."""
     if modes.status == Status.BAD_INPUT:
         return "not complete: such joints are none"
+    if modes.is_complete and modes.expected < 0:
+        return "complete: all that the closed form knows"
     if modes.is_complete and modes.method == "closed form":
         return f"complete: all {int(modes.expected)} solutions of the closed form, real and complex"
     if modes.is_complete:

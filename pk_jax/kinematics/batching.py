@@ -28,6 +28,11 @@ def _home_shapes(tree: Any, leaves: tuple) -> tuple[Any, jax.ShapeDtypeStruct]:
     return jax.eval_shape(lambda mech: mech.home(), mech)
 
 
+def equations(mech: Mechanism) -> int:
+    """c, the number of closure equations."""
+    return jax.eval_shape(lambda mech: mech.residual(*mech.home()), mech).shape[0]
+
+
 def rows_of(name: str, value: Any, one: Any, *, numpy: bool = False) -> tuple[Any, bool]:
     """`value` with the leaves of `one`, or with one leading batch axis more; and whether it has that axis."""
     if isinstance(one, Turning):

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from pk_jax.kinematics.homotopy import End, apart
-from pk_jax.kinematics.monodromy import SEED, SOLUTIONS, between, generic_start, random_legs
-from pk_jax.kinematics.study import Legs
+from pk_jax.kinematics.modes.homotopy import End, apart
+from pk_jax.kinematics.modes.monodromy import SEED, SOLUTIONS, between, generic_start, random_legs
+from pk_jax.kinematics.modes.study import Legs
 
 SAME = 1e-8  # distance in P^7 of two regular ends that are one solution
 NEAR = 1e-3  # the same of ends on a singular solution, where paths stop short of it

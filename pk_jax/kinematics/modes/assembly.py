@@ -14,22 +14,20 @@ from pk_jax.geometry import rotations
 from pk_jax.geometry.poses import Turning, features, like, place, pose_units, tangent_size
 from pk_jax.geometry.se3 import SE3
 from pk_jax.geometry.spread import evenly, quaternions
-from pk_jax.kinematics.batching import home_shapes, is_possible, rows_of
+from pk_jax.kinematics.batching import equations, home_shapes, is_possible, rows_of
 from pk_jax.kinematics.certify import certify, check_known
 from pk_jax.kinematics.closure import pose_scale
 from pk_jax.kinematics.forward import ForwardKinematics, solved_from
-from pk_jax.kinematics.monodromy import SOLUTIONS
-from pk_jax.kinematics.stewart_modes import layout_of
-from pk_jax.kinematics.study import motion_of
+from pk_jax.kinematics.modes.monodromy import SOLUTIONS
+from pk_jax.kinematics.modes.stewart import layout_of
+from pk_jax.kinematics.modes.study import motion_of
 from pk_jax.mechanisms.base import LegMechanism, Mechanism, require_mechanism
 from pk_jax.mechanisms.stewart import LEGS, Stewart
 from pk_jax.status import Status
 
 STARTS = 256  # of a search from many starts
-REAL_TO = (
-    1e-6,
-    1e-3,
-)  # imaginary part of x and y, |x| = 1, of a regular and of a multiple solution that may be real
+REAL_TO = 1e-6  # imaginary part of x and y, |x| = 1, of a solution that may be real
+MULTIPLE_REAL_TO = 1e-3  # the same of a multiple one, where paths stop short of it
 SAME_TO = 1e-6  # tangent between two solutions that are one, of the natural size of each coordinate
 MOVED_TO = 1e-3  # the same between an end and the real pose that it stands for
 
@@ -42,7 +40,7 @@ class Fate(enum.IntEnum):
     AT_INFINITY = 2  # or so near it that double precision sees no difference: no pose
     LOST = 3
     DUPLICATE = 4  # ended where an earlier one did: on a multiple solution, or at a search's known mode
-    EXCLUDED = 5  # a pose of the six legs that the sensors do not agree with
+    EXCLUDED = 5  # fits some of the joints, but redundant ones (or sensors) do not agree
 
 
 class AssemblyModes(NamedTuple):
@@ -56,8 +54,9 @@ class AssemblyModes(NamedTuple):
     count: np.ndarray  # () real poses
     fates: np.ndarray  # (slots,) Fate
     is_complete: np.ndarray  # () every solution that there can be is accounted for
-    expected: np.ndarray  # () finite solutions at almost all joints, real and complex; -1: not known
-    # () OK; complete, but no pose: UNREACHABLE, or INCONSISTENT sensors; INCOMPLETE; BAD_INPUT
+    # () finite solutions at almost all joints, real and complex, of a platform's six legs; -1: not known
+    expected: np.ndarray
+    # () OK; complete, but no pose: UNREACHABLE, or INCONSISTENT redundant joints; INCOMPLETE; BAD_INPUT
     status: np.ndarray
     residual: np.ndarray  # (slots,) |F|, evaluated afresh
     sigma_min: np.ndarray  # (slots,) as of `forward_kinematics`
@@ -107,18 +106,21 @@ def assembly_modes(
     require_mechanism("assembly_modes", mech)
     check_known("assembly_modes", mech, joints)
     joints, is_many = rows_of("joints", joints, home_shapes(mech)[1], numpy=True)
-    method, solve = _method(mech)
-    rows = []
-    for done, row in enumerate(joints if is_many else joints[None]):
-        rows.append(_one(mech, row, method, solve))
-        if report is not None:
-            report("assembly modes: rows", done + 1, len(joints) if is_many else 1)
-    if not rows:
+    joints = joints if is_many else joints[None]
+    if not len(joints):
         raise ValueError("joints must have at least one row, got none")
-    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *[row._replace(method=0) for row in rows])
-    whole = stacked if is_many else jax.tree.map(lambda leaf: leaf[0], stacked)
-    poses = jax.tree.map(jnp.asarray, whole.poses)
-    return whole._replace(poses=poses, method=method)
+    method, solve = _method(mech)
+    home = jax.device_get(mech.home())
+    rows = []
+    for row in joints:
+        rows.append(_one(mech, home, row, solve))
+        if report is not None:
+            report("assembly modes: rows", len(rows), len(joints))
+    modes = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+    is_certified, radius = _certified(mech, modes, joints)
+    modes = modes._replace(is_certified=is_certified, radius=radius)
+    modes = modes if is_many else jax.tree.map(lambda leaf: leaf[0], modes)
+    return modes._replace(poses=jax.tree.map(jnp.asarray, modes.poses), method=method)
 
 
 def _method(mech: Mechanism) -> tuple[str, Callable[[Mechanism, np.ndarray], _Found]]:
@@ -127,20 +129,20 @@ def _method(mech: Mechanism) -> tuple[str, Callable[[Mechanism, np.ndarray], _Fo
     return ("closed form", _by_closed_form) if hasattr(mech, "forward") else ("search", _by_search)
 
 
-def _one(mech: Mechanism, joints: np.ndarray, method: str, solve: Callable) -> AssemblyModes:
+def _one(mech: Mechanism, home: tuple[Any, np.ndarray], joints: np.ndarray, solve: Callable) -> AssemblyModes:
+    """One row, yet to be certified."""
     is_given = bool(is_possible(mech, joints))
-    found = solve(mech, joints if is_given else np.asarray(mech.home()[1]))
+    found = solve(mech, joints if is_given else home[1])
     if not is_given:
         poses = jax.tree.map(lambda leaf: np.full_like(leaf, np.nan), found.poses)
         found = found._replace(poses=poses, fates=np.full_like(found.fates, Fate.LOST), is_complete=False)
     judged, fates = _judged(mech, joints, found)
     is_real = fates == Fate.FINITE_REAL
-    from_home = _apart(mech, judged.candidate, jax.tree.map(lambda leaf: leaf[None], mech.home()[0]))[:, 0]
+    from_home = _apart(mech, judged.candidate, jax.tree.map(lambda leaf: leaf[None], home[0]))[:, 0]
     order = np.lexsort((from_home, fates))
     judged, is_real, fates = jax.tree.map(lambda leaf: leaf[order], (judged, is_real, fates))
     masked = lambda leaf: np.where(is_real.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, np.nan)
     poses = jax.tree.map(masked, judged.candidate)
-    is_certified, radius = _certified(mech, poses, joints)
     is_complete = found.is_complete and Fate.LOST not in fates
     none = Status.INCONSISTENT if Fate.EXCLUDED in fates else Status.UNREACHABLE
     status = Status.OK if is_real.any() else none
@@ -155,10 +157,10 @@ def _one(mech: Mechanism, joints: np.ndarray, method: str, solve: Callable) -> A
         np.int32(status if is_given else Status.BAD_INPUT),
         *map(masked, (judged.residual, judged.sigma_min, judged.det_sign)),
         _mirrors(mech, joints, poses, is_real),
-        is_certified,
-        radius,
-        np.int32(found.retries),
-        method,
+        is_certified=None,
+        radius=None,
+        retries=np.int32(found.retries),
+        method=None,
     )
 
 
@@ -172,7 +174,9 @@ def _by_homotopy(mech: Stewart, joints: np.ndarray) -> _Found:
     regular, multiple = len(found.regular), len(found.multiple)
     points = np.concatenate([found.regular, found.multiple])
     points = points / np.sqrt(np.sum(points[:, :4] ** 2, axis=1, keepdims=True))
-    real_to = np.repeat(REAL_TO, [regular, multiple]) * np.maximum(1, np.linalg.norm(points, axis=1))
+    real_to = np.repeat([REAL_TO, MULTIPLE_REAL_TO], [regular, multiple]) * np.maximum(
+        1, np.linalg.norm(points, axis=1)
+    )
     is_near = np.linalg.norm(points.imag, axis=1) < real_to
     fates = np.full(SOLUTIONS, Fate.AT_INFINITY, np.int32)
     fates[: regular + found.met] = Fate.DUPLICATE
@@ -190,8 +194,10 @@ _motions = jax.jit(jax.vmap(motion_of))
 
 def _by_closed_form(mech: Mechanism, joints: np.ndarray) -> _Found:
     poses, is_real = jax.device_get(_forward(mech, joints))
-    fates = np.where(is_real, Fate.LOST, Fate.FINITE_COMPLEX).astype(np.int32)
-    return _Found(poses, fates, is_complete=True, expected=len(is_real))
+    is_square = equations(mech) == tangent_size(home_shapes(mech)[0])
+    otherwise = Fate.FINITE_COMPLEX if is_square else Fate.EXCLUDED
+    fates = np.where(is_real, Fate.LOST, otherwise).astype(np.int32)
+    return _Found(poses, fates, is_complete=True, expected=len(fates) if is_square else -1)
 
 
 @jax.jit
@@ -240,13 +246,16 @@ def _judged(mech: Mechanism, joints: np.ndarray, found: _Found) -> tuple[Forward
     return judged, fates
 
 
-def _certified(mech: Mechanism, poses: Any, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _certified(mech: Mechanism, modes: AssemblyModes, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What is proved of the real poses of all rows at once. -> (rows, slots) twice"""
+    is_certified, radius = np.zeros(modes.is_real.shape, bool), np.full(modes.is_real.shape, np.nan)
+    at = np.nonzero(modes.is_real)
     try:
-        found = certify(mech, poses, joints)
+        found = certify(mech, jax.tree.map(lambda leaf: leaf[at], modes.poses), joints[at[0]])
     except ValueError:  # its residual has no bounds
-        count = len(jax.tree.leaves(poses)[0])
-        return np.zeros(count, bool), np.full(count, np.nan)
-    return np.asarray(found.is_certified), np.asarray(found.radius)
+        return is_certified, radius
+    is_certified[at], radius[at] = found.is_certified, found.radius
+    return is_certified, radius
 
 
 def _apart(mech: Mechanism, poses: Any, others: Any) -> np.ndarray:

@@ -15,10 +15,10 @@ from pk_jax import checks
 from pk_jax.geometry import rotations
 from pk_jax.geometry.poses import Turning, features, like, pose_units, position, retract, tangent_size
 from pk_jax.geometry.spread import evenly, quaternions
-from pk_jax.kinematics.assembly import AssemblyModes
-from pk_jax.kinematics.batching import home_shapes, rows_of
+from pk_jax.kinematics.batching import equations, home_shapes, rows_of
 from pk_jax.kinematics.inverse import working_modes
 from pk_jax.kinematics.jacobian import SINGULAR_BELOW, scaled_jacobians
+from pk_jax.kinematics.modes.assembly import AssemblyModes
 from pk_jax.kinematics.track import CLOSEST
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 
@@ -138,8 +138,8 @@ def _checked(mech: Mechanism, joints: Any, modes: AssemblyModes) -> np.ndarray:
 
 def _has_sign(mech: Mechanism) -> bool:
     """Whether A, of the rows that carry force, is square."""
-    equations = jax.eval_shape(lambda mech: mech.residual(*mech.home()), mech).shape[0]
-    return tangent_size(home_shapes(mech)[0]) == min(equations, mech.actuated_rows or equations)
+    count = equations(mech)
+    return tangent_size(home_shapes(mech)[0]) == min(count, mech.actuated_rows or count)
 
 
 def _links(modes: AssemblyModes, paths: dict[int, Any]) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The generic Stewart platform that every homotopy starts from, with its forty poses: found by monodromy.
 
-    python -m pk_jax.kinematics.monodromy            writes homotopy_start.json beside this file anew
+    python -m pk_jax.kinematics.modes.monodromy            writes homotopy_start.json beside this file anew
 
 A random point of P^7 and random joints have legs that reach it: one solution of one complex platform.
 Following it around loops in the space of platforms permutes the solutions and so finds the others. There are
@@ -18,8 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pk_jax.kinematics.homotopy import End, Paths, Pencil, apart, follow
-from pk_jax.kinematics.study import NORM, Legs, quadrics
+from pk_jax.kinematics.modes.homotopy import End, Paths, Pencil, apart, follow
+from pk_jax.kinematics.modes.study import NORM, Legs, quadrics
 
 SOLUTIONS = 40
 SEED = 2026
@@ -90,7 +90,7 @@ def write(path: Path = FILE, seed: int = SEED) -> None:
     jax.config.update("jax_enable_x64", True)
     legs, points = by_monodromy(seed)
     pairs = lambda array: np.stack([array.real, array.imag], axis=-1).tolist()
-    kept = {"made_by": f"python -m pk_jax.kinematics.monodromy (seed {seed})"}
+    kept = {"made_by": f"python -m pk_jax.kinematics.modes.monodromy (seed {seed})"}
     kept |= {name: pairs(value) for name, value in legs._asdict().items()} | {"solutions": pairs(points)}
     path.write_text(json.dumps(kept, indent=1) + "\n")
     residual = np.abs(np.einsum("nij,ki,kj->kn", np.asarray(quadrics(legs)), points, points)).max()

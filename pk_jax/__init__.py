@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from pk_jax.geometry.se3 import SE3 as SE3
     from pk_jax.kinematics.certify import Certified as Certified
     from pk_jax.kinematics.certify import certify as certify
+    from pk_jax.kinematics.forward import CertifiedKinematics as CertifiedKinematics
     from pk_jax.kinematics.forward import ForwardKinematics as ForwardKinematics
     from pk_jax.kinematics.forward import forward_kinematics as forward_kinematics
     from pk_jax.kinematics.inverse import InverseKinematics as InverseKinematics
@@ -200,6 +201,7 @@ _NAMES = {
         "assembly_modes",
     ),
     "pk_jax.kinematics.forward": (
+        "CertifiedKinematics",
         "ForwardKinematics",
         "forward_kinematics",
     ),

@@ -511,8 +511,8 @@ def test_forward_kinematics_certifies_what_is_ok():
     one = pk.forward_kinematics(mech, joints[0], certify=True)
     assert one.is_certified and one.radius.shape == () and one.radius < 1e-13
     plain = pk.forward_kinematics(mech, joints)
-    assert plain.is_certified is None and plain.radius is None
-    np.testing.assert_array_equal(plain.pose, found.pose)
+    for mine, others in zip(plain, found[:7], strict=True):  # certifying changes nothing else
+        np.testing.assert_array_equal(mine, others)
 
 
 # ---------------------------------------------------------------- refusals

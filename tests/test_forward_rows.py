@@ -128,6 +128,7 @@ def test_a_batch_equals_the_traced_batch(found):
     assert_equal_rows(traced, take(found, slice(4096)))
 
 
+@pytest.mark.soak
 def test_a_batch_equals_vmapped_rows(found):
     solve = lambda q: pk.forward_kinematics(SEMI, q)
     for function in (solve, jax.vmap(solve)):

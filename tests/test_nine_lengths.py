@@ -562,6 +562,7 @@ def test_derivatives_at_a_residual_are_those_of_differences(rows, differentiated
             np.testing.assert_allclose(difference_along(solve), derivative, rtol=0, atol=1e-7)
 
 
+@pytest.mark.soak
 def test_a_known_platform_may_be_closed_over_by_jit():
     platform = some_platform(rng_of(43), PLANAR)
     found = jax.eval_shape(lambda lengths: pk.nine_length_pose(platform, lengths), np.ones((8, 9)))

@@ -345,6 +345,7 @@ def differ(joints, others):
     return np.abs(np.exp(1j * np.asarray(joints)) - np.exp(1j * np.asarray(others))).max(axis=1)
 
 
+@pytest.mark.soak
 def test_redundant_actuation_rules_nothing_out():
     """A mode of the four arms as at home is reached; one with an elbow turned is not found."""
     mech = pk.catalogued("4-rrr")

@@ -209,6 +209,7 @@ def test_wrong_paths_are_refused():
 # ---------------------------------------------------------------- jit, vmap, derivatives
 
 
+@pytest.mark.soak
 def test_many_paths_are_a_loop_of_paths(followed):
     spoiled = PATH.copy()
     spoiled[5] = NAN

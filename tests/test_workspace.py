@@ -258,6 +258,7 @@ def test_two_rpr_gradients():
         np.testing.assert_allclose(slope, stencil / (60 * h), atol=1e-10)
 
 
+@pytest.mark.soak
 def test_gradient_of_a_mechanism_is_a_mechanism():
     mech = five_bar(2.0, 0.5)
     gradient = jax.grad(lambda m: pk.workspace_indices(m).gii)(mech)

@@ -47,13 +47,25 @@ class ForwardKinematics(NamedTuple):
     sigma_min: jax.Array  # () lower bound of the least singular value of A without units
     det_sign: jax.Array  # () sign of det A over its sign at home; 0 where actuation is redundant
     candidate: Any  # the last iterate, whatever the status
-    is_certified: Any = None  # () where it was asked for: what `certify` proves of the pose,
-    radius: Any = None  # () m, and how far the exact solution is from it at most
+
+
+class CertifiedKinematics(NamedTuple):
+    """`ForwardKinematics`, and what `certify` proves of each pose."""
+
+    pose: Any
+    status: jax.Array
+    residual: jax.Array
+    steps: jax.Array
+    sigma_min: jax.Array
+    det_sign: jax.Array
+    candidate: Any
+    is_certified: jax.Array  # () an exact solution is near the pose, and is the only one there
+    radius: jax.Array  # () m, how far it is from the pose at most; NaN where none is certified
 
 
 def forward_kinematics(
     mech: Mechanism, joints: Any, guess: Any = None, *, certify: bool = False
-) -> ForwardKinematics:
+) -> ForwardKinematics | CertifiedKinematics:
     """The pose for given joints, by damped Newton from `guess` (default: home).
 
     joints:  (m,) or (batch, m)
@@ -79,7 +91,7 @@ def forward_kinematics(
         check_known("forward_kinematics with certify=True", mech, joints, guess)
         found = forward_kinematics(mech, joints, guess)
         proved = prove(mech, found.pose, joints)
-        return found._replace(is_certified=proved.is_certified, radius=proved.radius)
+        return CertifiedKinematics(*found, proved.is_certified, proved.radius)
     if checks.is_concrete((mech, joints, guess)) and (found := _known(mech, joints, guess)) is not None:
         return found
     home_pose, home_joints = home_shapes(mech)

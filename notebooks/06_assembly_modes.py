@@ -85,12 +85,13 @@ assert np.all(proof.is_certified) and one.is_certified
 #
 # It was assembled at home and never crosses a type II singularity. A mode on the other side of det A = 0
 # cannot be reached; to others a way is sought, and checked. Modes that are linked by a way share a group:
-# here all of one sign do, so that the sign of det A alone does not tell the mode.
+# here all of one sign do, so that the sign of det A alone does not tell the mode. A way's clearance is the
+# least singular value of A on it, of which `sigma_min` above is a lower bound.
 
 # %%
 links = pk.connect_modes(robot, lengths, modes)
 for k in range(count):
-    clearance = "" if np.isnan(links.clearance[k]) else f", sigma_min on the way {links.clearance[k]:.3f}"
+    clearance = "" if np.isnan(links.clearance[k]) else f", clearance of the way {links.clearance[k]:.3f}"
     print(f"mode {k + 1}: {pk.Link(int(links.to_home[k])).name}, group {links.group[k]}{clearance}")
 assert links.to_home[0] == pk.Link.PATH
 

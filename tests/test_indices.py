@@ -11,8 +11,6 @@ from outsiders import delta, three_legs, three_rpr
 import pk_jax as pk
 from pk_jax import Status
 
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
-
 R, LA, LB = 1.0, 1.3, 1.9
 RPR = pk.TwoRPR(half_base=R, l_min=1.0, l_max=3.0)
 ARMS = pk.FiveBar(half_base=R, proximal=LA, distal=LB)

@@ -10,8 +10,6 @@ from outsiders import delta, three_legs, three_rpr
 import pk_jax as pk
 from pk_jax import Status
 
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
-
 RPR = pk.TwoRPR(half_base=1.0, l_min=1.0, l_max=3.0)
 ARMS = pk.FiveBar(half_base=1.0, proximal=1.0, distal=2.15)
 DELTA = delta()

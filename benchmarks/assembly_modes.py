@@ -58,7 +58,7 @@ def general(count: int) -> None:
     rng = np.random.default_rng(0)
     stewart, _, lengths = random_problem(rng)
     _, first = timed(lambda: pk.assembly_modes(stewart, lengths))
-    complete, own, retried, again, seconds, real = 0, 0, 0, [], [], []
+    complete, own, retried, certified, again, seconds, real = 0, 0, 0, 0, [], [], []
     for _ in range(count):
         stewart, pose, lengths = random_problem(rng)
         modes, took = timed(lambda s=stewart, q=lengths: pk.assembly_modes(s, q))
@@ -68,9 +68,11 @@ def general(count: int) -> None:
         off = np.abs(np.asarray(modes.poses.rotation) - np.asarray(pose.rotation)).max(axis=(1, 2))
         own += bool(np.nanmin(off) < 1e-8)
         retried += int(modes.retries) > 0
+        certified += int(np.sum(modes.is_certified))
         real.append(int(modes.count))
     print(f"general platforms, {count} random ones; first call, with compiling, {first:.1f} s")
     print(f"  40 distinct solutions and complete {complete}, own pose among them {own}, retried {retried}")
+    print(f"  real poses {sum(real)}, certified {certified}")
     print(f"  a new platform: median {np.median(seconds):.3f} s, slowest {np.max(seconds):.3f} s")
     print(f"  other lengths of one that was met: median {np.median(again):.3f} s")
     numbers, platforms = np.unique(real, return_counts=True)

@@ -282,6 +282,24 @@ def test_lost_paths_are_said(monkeypatch):
     assert all(holds(whole, real_poses(modes)[k]) for k in range(int(modes.count)))
 
 
+def test_a_real_solution_that_does_not_close_is_lost_and_not_called_complex(monkeypatch):
+    solved = assembly.solved_from
+
+    def stalling(*arguments):
+        found = jax.device_get(solved(*arguments))
+        status = found.status.copy()
+        status[np.flatnonzero(status == Status.OK)[0]] = Status.STALLED
+        return found._replace(status=status)
+
+    stewart = random_platform(np.random.default_rng(11))
+    lengths = leg_lengths(stewart, HOME)
+    whole = pk.assembly_modes(stewart, lengths)
+    monkeypatch.setattr(assembly, "solved_from", stalling)
+    modes = pk.assembly_modes(stewart, lengths)
+    assert modes.count == whole.count - 1 and modes.tally()["LOST"] == 1
+    assert modes.status == Status.INCOMPLETE and not modes.is_complete
+
+
 # --- sensors
 
 

@@ -180,7 +180,7 @@ def _by_homotopy(mech: Stewart, joints: np.ndarray) -> _Found:
     is_near = np.linalg.norm(points.imag, axis=1) < real_to
     fates = np.full(SOLUTIONS, Fate.AT_INFINITY, np.int32)
     fates[: regular + found.met] = Fate.DUPLICATE
-    fates[: regular + multiple] = Fate.FINITE_COMPLEX
+    fates[: regular + multiple] = np.where(is_near, Fate.LOST, Fate.FINITE_COMPLEX)  # until they close
     fates[SOLUTIONS - found.lost :] = Fate.LOST
     maybe = np.full((SOLUTIONS, 8), np.nan)
     maybe[: len(points)][is_near] = points[is_near].real

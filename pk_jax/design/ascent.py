@@ -70,19 +70,37 @@ def judge(state: Ascent, value: jax.Array, gradient: jax.Array, tolerance: float
     accepted = _aim(
         state._replace(box=trial, value=value, gradient=gradient, cuts=jnp.zeros_like(state.cuts))
     )
-    # the parabola through both values and the slope, kept within [0.1, 0.5] of the step
-    curvature = promised - (value - state.value)
-    shorter = jnp.where(curvature > 0, promised / (2 * curvature), 0.5)
-    refused = state._replace(
-        length=state.length * jnp.clip(jnp.nan_to_num(shorter, nan=0.1), 0.1, 0.5), cuts=state.cuts + 1
-    )
-    new = jax.tree.map(lambda a, b: jnp.where(accept, a, b), accepted, refused)
+    new = jax.tree.map(lambda a, b: jnp.where(accept, a, b), accepted, shortened(state, value))
     new = new._replace(evaluations=state.evaluations + 1)
     is_still = stationarity(new.box, new.gradient) <= tolerance
     # what the next step promises would drown in the roundoff of the value
     is_spent = new.gradient @ new.toward <= ROUNDOFFS * jnp.finfo(value.dtype).eps * (1 + jnp.abs(value))
     new = new._replace(is_done=is_still | (accept & is_spent) | (new.cuts > MOST_CUTS))
     return jax.tree.map(lambda old, new: jnp.where(state.is_done, old, new), state, new)
+
+
+def shortened(state: Ascent, value: jax.Array) -> Ascent:
+    """The trial, which had this value, is refused: a shorter step."""
+    promised = state.gradient @ (propose(state) - state.box)
+    # the parabola through both values and the slope, kept within [0.1, 0.5] of the step
+    curvature = promised - (value - state.value)
+    shorter = jnp.where(curvature > 0, promised / (2 * curvature), 0.5)
+    length = state.length * jnp.clip(jnp.nan_to_num(shorter, nan=0.1), 0.1, 0.5)
+    return state._replace(length=length, cuts=state.cuts + 1)
+
+
+def is_free(box: jax.Array, gradient: jax.Array) -> jax.Array:
+    """Variables that the gradient does not push out of the box. -> (n,) bool"""
+    return ~(((box <= 0) & (gradient < 0)) | ((box >= 1) & (gradient > 0)))
+
+
+def within_reach(toward: jax.Array, uphill: jax.Array) -> jax.Array:
+    """A direction, or the gradient where it does not ascend, no longer than may be tried. -> (n,)"""
+    ascends = toward @ uphill > 1e-8 * jnp.linalg.norm(toward) * jnp.linalg.norm(uphill)
+    ascends = ascends & jnp.all(jnp.isfinite(toward))
+    toward = jnp.where(ascends, toward, uphill)  # not concave here: follow the gradient
+    longest = jnp.max(jnp.abs(toward))
+    return toward * jnp.minimum(1, LONGEST_STEP / jnp.where(longest > 0, longest, 1))
 
 
 def stationarity(box: Any, gradient: Any) -> Any:
@@ -92,18 +110,12 @@ def stationarity(box: Any, gradient: Any) -> Any:
 
 def _aim(state: Ascent) -> Ascent:
     """A direction of ascent on the free variables. A new set of bounds starts with an empty memory."""
-    pushes_out = ((state.box <= 0) & (state.gradient < 0)) | ((state.box >= 1) & (state.gradient > 0))
-    free = ~pushes_out
+    free = is_free(state.box, state.gradient)
     uphill = jnp.where(free, state.gradient, 0)
     same_face = jnp.all(free == state.free)
     memory = jax.tree.map(
         lambda kept, empty: jnp.where(same_face, kept, empty), state.memory, _direction.init(state.box)
     )
     downhill, memory = _direction.update(-uphill, memory, state.box)
-    toward = jnp.where(free, -downhill, 0)
-    ascends = toward @ uphill > 1e-8 * jnp.linalg.norm(toward) * jnp.linalg.norm(uphill)
-    ascends = ascends & jnp.all(jnp.isfinite(toward))
-    toward = jnp.where(ascends, toward, uphill)  # not concave here: follow the gradient
-    longest = jnp.max(jnp.abs(toward))
-    toward = toward * jnp.minimum(1, LONGEST_STEP / jnp.where(longest > 0, longest, 1))
+    toward = within_reach(jnp.where(free, -downhill, 0), uphill)
     return state._replace(toward=toward, length=jnp.ones_like(state.length), free=free, memory=memory)

@@ -1,4 +1,4 @@
-"""Maximize the composite index of a design space by gradients, from many starts at once."""
+"""Maximize the composite index of a design space by gradients, from many starts at once; or any problem."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ from pk_jax.design.objective import (
     require_bounds,
     require_weights,
 )
+from pk_jax.design.optimum import OptimizedDesign
+from pk_jax.design.problem import DesignProblem
+from pk_jax.design.search import optimize_problem
 from pk_jax.design.variables import DesignSpace
 from pk_jax.geometry.spread import evenly
 from pk_jax.mechanisms.base import Mechanism
@@ -59,27 +62,34 @@ class DesignResult(NamedTuple):
 
 
 def optimize_design(
-    space: DesignSpace,
-    weights: Any = (1, 1, 1),
+    space: DesignSpace | DesignProblem,
+    weights: Any = None,
     *,
     bounds: Any = None,
-    starts: Any = 12,
-    steps: int = 100,
+    starts: Any = None,
+    steps: int | None = None,
     tolerance: float | None = None,
     report: Report | None = None,
-) -> DesignResult:
-    """The design of greatest composite index (Nam, Lee and Park 2006, eq. 28).
+) -> DesignResult | OptimizedDesign:
+    """The design of greatest composite index (Nam, Lee and Park 2006, eq. 28), or that of a `DesignProblem`.
 
-    weights:    (3,) of GII, GRI, SUI, each >= 0, not all zero
+    weights:    (3,) of GII, GRI, SUI, each >= 0, not all zero; default: all alike
     bounds:     normalization (lower (3,), upper (3,)); default: `index_bounds(space)`, frozen
-    starts:     how many, spread evenly over the space; or design vectors (n,) or (k, n)
-    steps:      evaluations of value and gradient that each start may take
+    starts:     how many, spread evenly over the space; or design vectors (n,) or (k, n); default 12
+    steps:      evaluations of value and gradient that each start may take; default 100
     tolerance:  of the projected gradient in the unit box; default 1e-7 (float32: 1e-3)
     report:     called after every step with (what, steps done, steps allowed, best value)
+
+    A problem has neither weights nor bounds, and the other defaults of `optimize_problem`.
     """
+    if isinstance(space, DesignProblem):
+        return _optimize_problem(space, weights, bounds, starts, steps, tolerance, report)
     if not isinstance(space, DesignSpace):
-        raise ValueError(f"space must come from design_space(...), got {type(space).__name__}")
-    weights = require_weights(weights)
+        raise ValueError(
+            f"space must come from design_space(...) or be a DesignProblem, got {type(space).__name__}"
+        )
+    starts, steps = 12 if starts is None else starts, 100 if steps is None else steps
+    weights = require_weights((1, 1, 1) if weights is None else weights)
     checks.is_count("steps", steps, most=100_000)
     _tolerance(tolerance)
     _start_boxes(space, starts)  # what is wrong is told before anything is computed
@@ -110,6 +120,14 @@ def optimize_design(
         found.evaluations_in_all,
         status,
     )
+
+
+def _optimize_problem(problem, weights, bounds, starts, steps, tolerance, report) -> OptimizedDesign:
+    for name, value in (("weights", weights), ("bounds", bounds)):
+        if value is not None:
+            raise ValueError(f"{name} belong to the composite index: leave them out for a DesignProblem")
+    given = {name: value for name, value in (("starts", starts), ("steps", steps)) if value is not None}
+    return optimize_problem(problem, tolerance=tolerance, report=report, **given)
 
 
 def index_bounds(space: DesignSpace, *, report: Report | None = None) -> IndexBounds:

@@ -59,7 +59,8 @@ class Stewart(LegMechanism):
         middles = np.deg2rad(30.0 + 120.0 * ((leg + 1) // 2)), np.deg2rad(90.0 + 120.0 * (leg // 2))
         side = np.where(leg % 2 == 0, 1.0, -1.0)
         angles = middles[0] + side * base_half_angle, middles[1] - side * platform_half_angle
-        base, platform = (np.stack([np.cos(a), np.sin(a), 0 * a], axis=1) for a in angles)
+        xp = np if checks.is_concrete((base_half_angle, platform_half_angle)) else jnp
+        base, platform = (xp.stack([xp.cos(a), xp.sin(a), 0 * a], axis=1) for a in angles)
         return cls(base=base_radius * base, platform=platform_radius * platform)
 
     def check_shapes(self) -> None:

@@ -102,6 +102,11 @@ def to_angles(r: jax.Array) -> jax.Array:
     return jnp.stack([roll, pitch, yaw])
 
 
+def haar_density(v: jax.Array) -> jax.Array:
+    """Volume of rotations per volume of rotation vectors, (2 sin(t/2) / t)^2 with t = |v|. -> ()"""
+    return _sine_ratio(jnp.sum(v * v) / 4) ** 2
+
+
 # functions of the square of an angle, or of its sine, with derivatives of every order at zero
 
 SMALL = 1e-2

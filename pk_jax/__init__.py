@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from pk_jax.analysis.certificate import certify_regular as certify_regular
     from pk_jax.analysis.indices import LocalIndices as LocalIndices
     from pk_jax.analysis.indices import local_indices as local_indices
+    from pk_jax.analysis.integral import IntegralGradient as IntegralGradient
+    from pk_jax.analysis.integral import WorkspaceIntegral as WorkspaceIntegral
+    from pk_jax.analysis.integral import integral_gradient as integral_gradient
+    from pk_jax.analysis.integral import workspace_integral as workspace_integral
     from pk_jax.analysis.loci import LocusCurve as LocusCurve
     from pk_jax.analysis.loci import SingularityLocus as SingularityLocus
     from pk_jax.analysis.loci import singularity_locus as singularity_locus
@@ -45,11 +49,27 @@ if TYPE_CHECKING:
     from pk_jax.design.calibration import Calibration as Calibration
     from pk_jax.design.calibration import calibrate as calibrate
     from pk_jax.design.calibration import stewart_from_log as stewart_from_log
+    from pk_jax.design.evaluate import DesignValues as DesignValues
+    from pk_jax.design.evaluate import evaluate_designs as evaluate_designs
+    from pk_jax.design.families import Family as Family
+    from pk_jax.design.families import design_family as design_family
     from pk_jax.design.objective import IndexBounds as IndexBounds
     from pk_jax.design.objective import composite_index as composite_index
+    from pk_jax.design.objectives import least_over as least_over
+    from pk_jax.design.objectives import margins_over as margins_over
+    from pk_jax.design.objectives import over_workspace as over_workspace
+    from pk_jax.design.objectives import rectangle as rectangle
     from pk_jax.design.optimize import DesignResult as DesignResult
     from pk_jax.design.optimize import index_bounds as index_bounds
     from pk_jax.design.optimize import optimize_design as optimize_design
+    from pk_jax.design.optimum import OptimizedDesign as OptimizedDesign
+    from pk_jax.design.pareto import ParetoDesigns as ParetoDesigns
+    from pk_jax.design.pareto import ParetoFront as ParetoFront
+    from pk_jax.design.pareto import pareto_designs as pareto_designs
+    from pk_jax.design.pareto import pareto_front as pareto_front
+    from pk_jax.design.pareto import pareto_problem as pareto_problem
+    from pk_jax.design.problem import DesignProblem as DesignProblem
+    from pk_jax.design.robust import robust as robust
     from pk_jax.design.sensor_placement import SensorPlacement as SensorPlacement
     from pk_jax.design.sensor_placement import place_sensors as place_sensors
     from pk_jax.design.variables import DesignSpace as DesignSpace
@@ -107,6 +127,36 @@ if TYPE_CHECKING:
     from pk_jax.viz.skeleton import draw as draw
 
 _NAMES = {
+    "pk_jax.analysis.integral": (
+        "IntegralGradient",
+        "WorkspaceIntegral",
+        "integral_gradient",
+        "workspace_integral",
+    ),
+    "pk_jax.design.evaluate": (
+        "DesignValues",
+        "evaluate_designs",
+    ),
+    "pk_jax.design.families": (
+        "Family",
+        "design_family",
+    ),
+    "pk_jax.design.objectives": (
+        "least_over",
+        "margins_over",
+        "over_workspace",
+        "rectangle",
+    ),
+    "pk_jax.design.optimum": ("OptimizedDesign",),
+    "pk_jax.design.pareto": (
+        "ParetoDesigns",
+        "ParetoFront",
+        "pareto_designs",
+        "pareto_front",
+        "pareto_problem",
+    ),
+    "pk_jax.design.problem": ("DesignProblem",),
+    "pk_jax.design.robust": ("robust",),
     "pk_jax.analysis.boxes": ("Certificate",),
     "pk_jax.analysis.certificate": (
         "certify_confined",

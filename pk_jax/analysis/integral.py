@@ -60,6 +60,7 @@ class _Plan(NamedTuple):
     nodes: int
     replicates: int
     is_single: bool
+    devices: tuple = ()  # that share the rays
 
 
 def workspace_integral(
@@ -80,6 +81,7 @@ def workspace_integral(
     replicates: int = 8,
     cells: int | None = None,
     seed: int = 0,
+    devices: Any = None,
 ) -> WorkspaceIntegral:
     """Volume of the workspace, and integral and mean of local indices over it. Differentiable in `mech`.
 
@@ -106,6 +108,7 @@ def workspace_integral(
                 (2048, for more than three freedoms 1024)
     replicates: sets of rays, from whose spread the error is estimated (at least 4)
     cells:      of the scan along each ray (64, for more than three freedoms 32)
+    devices:    rays are shared out to them (`jax.devices()`); sums then differ by roundoff; default: one
     seed:       which turns the sets of rays get; the same seed gives the same numbers
 
     Errors: panels and strokes: against a coarser rule, rays: 95 % of the spread over replicates. Gradients
@@ -128,6 +131,7 @@ def workspace_integral(
     unit = None
     if plan.rule == "rays":
         n = region.size(given.centre)
+        plan = plan._replace(devices=() if devices is None else tuple(devices))
         unit = jnp.asarray(
             direction_sets(n, _rays(rays, n), plan.replicates, checks.is_count("seed", seed, least=0)),
             jax.tree.leaves(given.centre)[0].dtype,
@@ -325,7 +329,7 @@ def _integral(plan: _Plan, given: Given, unit: jax.Array | None) -> WorkspaceInt
 def _replicates(plan: _Plan, given: Given, unit: jax.Array | None) -> tuple[jax.Array, Counts]:
     """The integrals by every rule that is compared. -> (r, 1 + f), Counts"""
     if plan.rule == "rays":
-        return many_rays(plan.problem, given, unit, plan.replicates)
+        return many_rays(plan.problem, given, unit, plan.replicates, plan.devices)
     if plan.rule == "panels":
         return panels(plan.problem, given, plan.nodes)
     fine, validity = stroke_rule.box(plan.problem, given, plan.nodes)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.sharding import Mesh, PartitionSpec
 
 from pk_jax.analysis import charts, rays
 from pk_jax.analysis.measures import measure_of
@@ -23,6 +24,7 @@ BLOCK = 256  # rays at a time
 BREAKS = 16  # cells of angles in which something changes, at most
 ROUNDS = 2  # changes in one cell, at most
 PANELS = 8  # of the circle, before it is broken
+LONGEST = 4  # axis of a region that no axis meets, over its shortest one
 PROBES = 40  # of a region along an axis, each nearer by 2 ** 0.5
 HALVINGS = 44  # of an angle between two rays
 
@@ -83,9 +85,10 @@ def whitening(problem: Problem, given: Given) -> tuple[jax.Array, jax.Array]:
 
 
 def _extents(problem: Problem, given: Given, wide: jax.Array) -> jax.Array:
-    """How far the region goes along each column of `wide`, to a few tenths; 1 where it is not met. -> (n,)
+    """How far the region goes along each column of `wide`, to a few tenths. -> (n,)
 
-    The barrier alone knows nothing of directions in which no limit rises or falls at the centre.
+    The barrier alone knows nothing of directions in which no limit rises or falls at the centre. An axis
+    that does not meet the region is taken to be no longer than those that do.
     """
     far = jax.vmap(partial(_farthest, problem, given), in_axes=-1)(wide)
     t = far * 2.0 ** (-0.5 * jnp.arange(PROBES, dtype=far.dtype))[:, None]
@@ -93,7 +96,11 @@ def _extents(problem: Problem, given: Given, wide: jax.Array) -> jax.Array:
     limits = jax.vmap(partial(limits_at, problem.region, given))(y.reshape(-1, len(wide)))
     is_inside = jnp.all(limits >= 0, axis=1).reshape(2, *t.shape)  # NaN compares False
     found = jnp.max(jnp.where(is_inside, t, 0), axis=(0, 1))
-    return jnp.where(found > 0, found, 1)
+    axes, scale = problem.region.axes, given.scale
+    shares = jnp.linalg.norm(wide / (scale if axes is None else scale[np.array(axes)])[:, None], axis=0)
+    longest = jnp.max(found * shares)
+    longest = jnp.where(longest > 0, longest, LONGEST * jnp.min(shares))
+    return jnp.where(found > 0, found, jnp.minimum(1, longest / shares))
 
 
 def _farthest(problem: Problem, given: Given, direction: jax.Array) -> jax.Array:
@@ -173,11 +180,11 @@ def in_blocks(rows: jax.Array, fill: float | None = None) -> jax.Array:
     return jnp.swapaxes(rows.reshape(-1, block, rows.shape[1]), 1, 2)
 
 
-def counted(found: Intervals, count: int) -> Counts:
-    """Of the first `count` rays."""
-    is_own = jnp.arange(found.is_open.size) < count
+def counted(found: Intervals, weights: jax.Array) -> Counts:
+    """Of the rays that weigh something; of one block each (blocks, rays)."""
+    is_own = jnp.any(weights != 0, axis=1)
     flags = found.is_open, found.is_crowded, found.is_grazing
-    return Counts(jnp.asarray(count), *(jnp.sum(flag.ravel() & is_own) for flag in flags))
+    return Counts(jnp.sum(is_own), *(jnp.sum(flag & is_own) for flag in flags))
 
 
 # --- in the plane: angles broken where the limits that end a ray change
@@ -199,7 +206,7 @@ def panels(problem: Problem, given: Given, angles: int) -> tuple[jax.Array, Coun
         directions = in_blocks(jax.vmap(toward)(theta))
         found = all_intervals(problem, given, directions)
         each = in_blocks((width[:, None] * weights).ravel()[:, None] * volume, 0.0)
-        return total(problem, given, directions, found, each, rule)[0], counted(found, len(theta))
+        return total(problem, given, directions, found, each, rule)[0], counted(found, each)
 
     rules = [padded_rule(count, problem.nodes) for count in (problem.nodes, 3 * problem.nodes // 4)]
     rules = jax.tree.map(lambda *parts: jnp.asarray(np.stack(parts), ends.dtype), *rules)
@@ -274,14 +281,34 @@ def direction_sets(n: int, count: int, replicates: int, seed: int) -> np.ndarray
     return np.concatenate(turned)
 
 
-def many_rays(problem: Problem, given: Given, unit: jax.Array, replicates: int) -> tuple[jax.Array, Counts]:
-    """The integrals by every set of directions, unit (replicates * k, n). -> (replicates, 1 + f), Counts"""
+def many_rays(
+    problem: Problem, given: Given, unit: jax.Array, replicates: int, devices: tuple = ()
+) -> tuple[jax.Array, Counts]:
+    """The integrals by every set of directions, unit (replicates * k, n). -> (replicates, 1 + f), Counts
+
+    devices: blocks of rays are shared out to them, and their sums added up
+    """
     n, count = unit.shape[1], unit.shape[0] // replicates
     wide, volume = whitening(problem, given)
     area = 2 * math.pi ** (n / 2) / math.gamma(n / 2)
     own = jnp.repeat(jnp.eye(replicates, dtype=unit.dtype), count, axis=0)
-    directions = in_blocks(unit @ wide.T)
-    found = all_intervals(problem, given, directions)
-    weights = in_blocks(own * (area * volume / count), 0.0)
+    directions, weights = in_blocks(unit @ wide.T), in_blocks(own * (area * volume / count), 0.0)
     rule = padded_rule(problem.nodes, problem.nodes)
-    return total(problem, given, directions, found, weights, rule), counted(found, len(unit))
+
+    def share(given, directions, weights):
+        found = all_intervals(problem, given, directions)
+        return total(problem, given, directions, found, weights, rule), counted(found, weights)
+
+    if len(devices) < 2:
+        return share(given, directions, weights)
+    fill = -len(directions) % len(devices)  # blocks that weigh nothing
+    directions = jnp.concatenate([directions, jnp.repeat(directions[-1:], fill, axis=0)])
+    weights = jnp.concatenate([weights, jnp.zeros((fill, *weights.shape[1:]), weights.dtype)])
+    rays, everywhere = PartitionSpec("rays"), PartitionSpec()
+    return jax.shard_map(
+        lambda *parts: lax.psum(share(*parts), "rays"),
+        mesh=Mesh(np.array(devices), ("rays",)),
+        in_specs=(everywhere, rays, rays),
+        out_specs=everywhere,
+        check_vma=False,
+    )(given, directions, weights)

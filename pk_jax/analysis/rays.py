@@ -183,9 +183,9 @@ def _brackets(
             jax.tree.map(partial(jnp.where, takes), new, end)
             for takes, end in ((is_ahead, low), (~is_ahead, high))
         )
-        closer = middle - value / jnp.where(slope == 0, 1, slope)
-        is_good = is_root & (k >= halvings) & (slope != 0) & (closer >= low[0]) & (closer <= high[0])
-        return low, high, jnp.where(is_good, closer, (low[0] + high[0]) / 2)
+        closer = jnp.clip(middle - value / jnp.where(slope == 0, 1, slope), low[0], high[0])
+        is_newton = is_root & (k >= halvings) & (slope != 0)
+        return low, high, jnp.where(is_newton, closer, (low[0] + high[0]) / 2)
 
     take = lambda cell: (jnp.take_along_axis(s.t, cell, axis=0), at(s.is_known, cell))
     low, high = take(cell), take(cell + 1)

@@ -227,7 +227,7 @@ def _region(given, axes, within, clearance, margins, length) -> Region:
     n = region.size(given.centre)
     if n not in (2, 3, 4, 6):
         raise ValueError(f"workspace_integral is for 2, 3, 4 or 6 coordinates that vary, got {n}")
-    if not count_limits(region, given):
+    if not sum(count_limits(region, given)):
         raise ValueError(f"{type(given.mech).__name__} has no margins: give it limits (strokes, cones, ...)")
     return region
 

@@ -17,6 +17,7 @@ import numpy as np
 from pk_jax import checks
 from pk_jax.analysis.singularity import singularity_distance
 from pk_jax.geometry import safe
+from pk_jax.geometry.matrices import small_det, small_inverse
 from pk_jax.geometry.poses import pose_units
 from pk_jax.kinematics.blocks import has_one_joint_an_equation, joint_blocks
 from pk_jax.kinematics.jacobian import joint_jacobian, pose_jacobian, units
@@ -53,33 +54,6 @@ def maps_of(mech: Mechanism, pose: Any, joints: jax.Array, length: Any = None) -
     return Maps(small_inverse(g.T @ g) @ g.T, g, unit)
 
 
-def small_inverse(matrix: jax.Array) -> jax.Array:
-    """A^-1 of a small square matrix; not finite where it is singular. -> (n, n)
-
-    Two and three rows by the adjugate, more by orthogonal elimination: both vectorize over batches,
-    which LAPACK's does not.
-    """
-    n = len(matrix)
-    if n == 1:
-        return 1 / matrix
-    if n == 2:
-        (a, b), (c, d) = matrix
-        return jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])]) / (a * d - b * c)
-    if n == 3:
-        crosses = jnp.cross(jnp.roll(matrix, -1, axis=0), jnp.roll(matrix, -2, axis=0))
-        return crosses.T / jnp.dot(matrix[0], crosses[0])
-    # rows made orthonormal one by one (twice is enough), what is done to them done to the identity
-    rows, done = list(matrix), list(jnp.eye(n, dtype=matrix.dtype))
-    for k in range(n):
-        for _ in range(2):
-            for i in range(k):
-                along = rows[k] @ rows[i]
-                rows[k], done[k] = rows[k] - along * rows[i], done[k] - along * done[i]
-        size = jnp.sqrt(rows[k] @ rows[k])
-        rows[k], done[k] = rows[k] / size, done[k] / size
-    return jnp.stack(rows).T @ jnp.stack(done)
-
-
 def frobenius_isotropy(mech: Mechanism, pose: Any, joints: jax.Array, length: Any = None) -> jax.Array:
     """n / (|J| |J^-1|), Frobenius norms: 1 where J is a scaled rotation, 0 at a singularity. Smooth. -> ()"""
     maps = maps_of(mech, pose, joints, length)
@@ -111,15 +85,6 @@ def resistivity(mech: Mechanism, pose: Any, joints: jax.Array, length: Any = Non
     if inverse.shape[0] == inverse.shape[1]:
         return jnp.abs(small_det(inverse))
     return jnp.sqrt(small_det(inverse.T @ inverse))
-
-
-def small_det(matrix: jax.Array) -> jax.Array:
-    """Determinant of a small matrix. -> ()"""
-    if len(matrix) == 2:
-        return matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
-    if len(matrix) == 3:
-        return jnp.dot(matrix[0], jnp.cross(matrix[1], matrix[2]))
-    return jnp.linalg.det(matrix)
 
 
 def stiffness_index(mech: Mechanism, pose: Any, joints: jax.Array, length: Any = None) -> jax.Array:

@@ -16,7 +16,16 @@ from pk_jax.analysis import charts, rays
 from pk_jax.analysis.measures import measure_of
 from pk_jax.analysis.quadrature import smooth_ends
 from pk_jax.analysis.rays import Detail, Intervals
-from pk_jax.analysis.region import Given, Region, count_limits, functions_at, joints_at, limits_at
+from pk_jax.analysis.region import (
+    Given,
+    Region,
+    added_limits_at,
+    count_limits,
+    functions_at,
+    joints_at,
+    plain_limits_at,
+)
+from pk_jax.analysis.whitening import farthest, whitening
 from pk_jax.geometry.spread import directions, evenly
 from pk_jax.kinematics.batching import where
 
@@ -24,8 +33,6 @@ BLOCK = 256  # rays at a time
 BREAKS = 16  # cells of angles in which something changes, at most
 ROUNDS = 2  # changes in one cell, at most
 PANELS = 8  # of the circle, before it is broken
-LONGEST = 4  # axis of a region that no axis meets, over its shortest one
-PROBES = 40  # of a region along an axis, each nearer by 2 ** 0.5
 HALVINGS = 44  # of an angle between two rays
 
 
@@ -64,56 +71,12 @@ def values_at(problem: Problem, given: Given, pose) -> jax.Array:
     return jnp.concatenate([one[None], *found])
 
 
-def whitening(problem: Problem, given: Given) -> tuple[jax.Array, jax.Array]:
-    """A linear map that makes the region about as wide in every direction, and its volume. -> (n, n), ()
-
-    Its ellipsoid is that of Dikin: the Hessian of the logarithmic barrier of all limits at the centre.
-    """
-    n = problem.region.size(given.centre)
-    zero = jnp.zeros(n, jax.tree.leaves(given.centre)[0].dtype)
-    of = lambda y: limits_at(problem.region, given, y)
-    value, slope = of(zero), jax.jacfwd(of)(zero)
-    is_known = jnp.isfinite(value) & jnp.all(jnp.isfinite(slope), axis=1)
-    away = jnp.maximum(jnp.abs(jnp.where(is_known, value, 1)), 1e-2)
-    rows = jnp.where(is_known[:, None], slope, 0) / away[:, None]
-    scale, axes = given.scale, problem.region.axes
-    own = jnp.diag(1 / (scale if axes is None else scale[np.array(axes)]) ** 2)
-    lower = jnp.linalg.cholesky(rows.T @ rows + 1e-4 * own)
-    wide = jnp.linalg.inv(lower).T
-    extents = _extents(problem, given, wide)
-    return lax.stop_gradient((wide * extents, jnp.prod(extents) / jnp.prod(jnp.diagonal(lower))))
-
-
-def _extents(problem: Problem, given: Given, wide: jax.Array) -> jax.Array:
-    """How far the region goes along each column of `wide`, to a few tenths. -> (n,)
-
-    The barrier alone knows nothing of directions in which no limit rises or falls at the centre. An axis
-    that does not meet the region is taken to be no longer than those that do.
-    """
-    far = jax.vmap(partial(_farthest, problem, given), in_axes=-1)(wide)
-    t = far * 2.0 ** (-0.5 * jnp.arange(PROBES, dtype=far.dtype))[:, None]
-    y = jnp.stack([t, -t])[..., None] * wide.T
-    limits = jax.vmap(partial(limits_at, problem.region, given))(y.reshape(-1, len(wide)))
-    is_inside = jnp.all(limits >= 0, axis=1).reshape(2, *t.shape)  # NaN compares False
-    found = jnp.max(jnp.where(is_inside, t, 0), axis=(0, 1))
-    axes, scale = problem.region.axes, given.scale
-    shares = jnp.linalg.norm(wide / (scale if axes is None else scale[np.array(axes)])[:, None], axis=0)
-    longest = jnp.max(found * shares)
-    longest = jnp.where(longest > 0, longest, LONGEST * jnp.min(shares))
-    return jnp.where(found > 0, found, jnp.minimum(1, longest / shares))
-
-
-def _farthest(problem: Problem, given: Given, direction: jax.Array) -> jax.Array:
-    whole = problem.region.whole(given.centre, direction)
-    return charts.farthest(given.mech, given.centre, given.scale, whole)
-
-
 def intervals(problem: Problem, given: Given, directions: jax.Array) -> Intervals:
     """Of rays y = t direction, directions (n, rays). Never differentiated."""
     given, directions = lax.stop_gradient((given, directions))
-    far = jax.vmap(partial(_farthest, problem, given), in_axes=-1)(directions)
+    far = jax.vmap(partial(farthest, problem.region, given), in_axes=-1)(directions)
     along = partial(_functions, problem.region, (given, directions))
-    return rays.intervals_of(along, count_limits(problem.region, given), far, problem.detail)
+    return rays.intervals_of(along, sum(count_limits(problem.region, given)), far, problem.detail)
 
 
 def _functions(region: Region, given_and_directions: tuple[Given, jax.Array], t: jax.Array) -> jax.Array:
@@ -124,14 +87,36 @@ def _functions(region: Region, given_and_directions: tuple[Given, jax.Array], t:
     return found.reshape(-1, *t.shape)
 
 
+def _limits_asked(region: Region, given_and_directions: Any, t: jax.Array, which: jax.Array) -> jax.Array:
+    """Of every distance the limit that is asked for. t, which (s, rays) -> (s, rays)
+
+    Where others are asked for, limits are evaluated at the centre: at a stretched leg the slopes of some
+    are infinite, and reverse mode multiplies them by zero.
+    """
+    given, directions = given_and_directions
+    first, second = count_limits(region, given)
+    found = jnp.zeros_like(t)
+    for of, begin, count in ((plain_limits_at, 0, first), (added_limits_at, first, second)):
+        if not count:
+            continue
+        is_own = (which >= begin) & (which < begin + count)
+        y = (directions[:, None] * jnp.where(is_own, t, 0)).reshape(len(directions), -1)
+        values = jax.vmap(partial(of, region, given), in_axes=-1, out_axes=-1)(y).reshape(-1, *t.shape)
+        own = jnp.take_along_axis(values, jnp.clip(which - begin, 0, count - 1)[None], axis=0)[0]
+        found = jnp.where(is_own, own, found)
+    return found
+
+
 def ray_integrals(
     problem: Problem, given: Given, directions: jax.Array, found: Intervals, rule: Any
 ) -> jax.Array:
     """sum over the intervals of f t^(n - 1) dt along each ray, for 1 and every integrand. -> (1 + f, rays)"""
     n, count = directions.shape
-    function = partial(_functions, problem.region)
-    lower = rays.root(function, (given, directions), found.lower, found.lower_by)
-    upper = rays.root(function, (given, directions), found.upper, found.upper_by)
+    function = partial(_limits_asked, problem.region)
+    limits = sum(count_limits(problem.region, given))
+    own = lambda by: jnp.where(by < limits, by, rays.ORIGIN)  # where only rays are broken nothing ends
+    lower = rays.root(function, (given, directions), found.lower, own(found.lower_by))
+    upper = rays.root(function, (given, directions), found.upper, own(found.upper_by))
     at, weights = (jnp.asarray(part, lower.dtype)[:, None, None] for part in rule)
     width = upper - lower
     t = (lower + width * at).reshape(-1, count)
@@ -195,7 +180,7 @@ def panels(problem: Problem, given: Given, angles: int) -> tuple[jax.Array, Coun
 
     By panels and intervals of `nodes` nodes, and by three quarters of them.
     """
-    wide, volume = whitening(problem, given)
+    wide, volume = whitening(problem.region, given)
     toward = lambda angle: wide @ jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     ends, crowded = lax.stop_gradient(_breaks(problem, given, toward, angles))
     width = ends[1:] - ends[:-1]
@@ -289,7 +274,7 @@ def many_rays(
     devices: blocks of rays are shared out to them, and their sums added up
     """
     n, count = unit.shape[1], unit.shape[0] // replicates
-    wide, volume = whitening(problem, given)
+    wide, volume = whitening(problem.region, given)
     area = 2 * math.pi ** (n / 2) / math.gamma(n / 2)
     own = jnp.repeat(jnp.eye(replicates, dtype=unit.dtype), count, axis=0)
     directions, weights = in_blocks(unit @ wide.T), in_blocks(own * (area * volume / count), 0.0)

@@ -203,9 +203,9 @@ def _flat(values: jax.Array) -> jax.Array:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def root(function: Any, given: Any, t: jax.Array, which: jax.Array) -> jax.Array:
-    """`t`, roots of function(given, t)[which], with the derivatives of the implicit function theorem.
+    """`t`, roots of function(given, t, which), with the derivatives of the implicit function theorem.
 
-    function: (given, t (s, rays)) -> (k, s, rays); t and which (s, rays). The rule calls the decorated
+    t, which and the function's values: (s, rays). The rule calls the decorated
     function itself, which makes it right for every order. 0 where the ray is tangent to the limit, or
     `which` says that there is none.
     """
@@ -216,7 +216,7 @@ def root(function: Any, given: Any, t: jax.Array, which: jax.Array) -> jax.Array
 def _root_jvp(function, primals, tangents):
     given, t, which = primals
     t = root(function, given, t, which)
-    of = lambda given, t: _of(function(given, t), jnp.maximum(which, 0))
+    of = lambda given, t: function(given, t, which)
     _, by = jax.jvp(lambda given: of(given, t), (given,), (tangents[0],))
     _, slope = jax.jvp(lambda t: of(given, t), (t,), (jnp.ones_like(t),))
     is_good = (which >= 0) & (slope != 0) & jnp.isfinite(slope)

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pk_jax.analysis.charts import pose_at, scale_of
-from pk_jax.analysis.measures import clearance, small_det
+from pk_jax.analysis.measures import clearance
 from pk_jax.geometry.axis_pose import AxisPose
+from pk_jax.geometry.matrices import small_det
 from pk_jax.geometry.poses import tangent_size
 from pk_jax.geometry.se3 import SE3
 from pk_jax.kinematics.jacobian import pose_jacobian
@@ -54,6 +55,7 @@ class Given(NamedTuple):
 
 def given_of(mech: Mechanism, centre: Any = None, branch: Any = None, free: Any = None) -> Given:
     """With everything that need not be computed again; a constant beside the mechanism."""
+    mech = mech.prepared()
     home = mech.home()
     centre = home[0] if centre is None else centre
     fixed = jax.lax.stop_gradient((centre, home))
@@ -69,14 +71,26 @@ def joints_at(given: Given, pose: Any) -> jax.Array:
 
 def limits_at(region: Region, given: Given, y: jax.Array) -> jax.Array:
     """Every limit at coordinates y, >= 0 inside, NaN where it has no value. -> (k,)"""
+    return jnp.concatenate([plain_limits_at(region, given, y), added_limits_at(region, given, y)])
+
+
+def plain_limits_at(region: Region, given: Given, y: jax.Array) -> jax.Array:
+    """The mechanism's margins and the limits of coordinates."""
     y = region.whole(given.centre, y)
     pose = pose_at(given.centre, y)
-    joints = joints_at(given, pose)
-    found = [jnp.ravel(value) for _, value in sorted(given.mech.margins(pose, joints).items())]
+    margins = given.mech.margins(pose, joints_at(given, pose))
+    found = [jnp.ravel(value) for _, value in sorted(margins.items())]
     values = _coordinates(pose, y)
     for which, least, greatest in region.coordinates:
         width = greatest - least
         found.append(jnp.stack([values[which] - least, greatest - values[which]]) / width)
+    return jnp.concatenate(found) if found else jnp.zeros(0, y.dtype)
+
+
+def added_limits_at(region: Region, given: Given, y: jax.Array) -> jax.Array:
+    """What a user adds to them. Its slopes may be infinite where a leg is stretched or folded."""
+    pose = pose_at(given.centre, region.whole(given.centre, y))
+    joints, found = joints_at(given, pose), [jnp.zeros(0, y.dtype)]
     if region.clearance is not None:
         kept = clearance(given.mech, pose, joints, region.length)
         home = clearance(given.mech, *given.home, region.length)
@@ -85,7 +99,7 @@ def limits_at(region: Region, given: Given, y: jax.Array) -> jax.Array:
     if region.margins is not None:
         added = region.margins(given.mech, pose, joints)
         found.extend(jnp.ravel(jnp.asarray(value)) for value in jax.tree.leaves(added))
-    return jnp.concatenate(found) if found else jnp.zeros(0, y.dtype)
+    return jnp.concatenate(found)
 
 
 def functions_at(region: Region, given: Given, y: jax.Array) -> jax.Array:
@@ -99,11 +113,13 @@ def functions_at(region: Region, given: Given, y: jax.Array) -> jax.Array:
     return found
 
 
-def count_limits(region: Region, given: Given) -> int:
-    """k, the number of limits."""
+def count_limits(region: Region, given: Given) -> tuple[int, int]:
+    """Numbers of the mechanism's own limits, and of those added."""
     n = region.size(given.centre)
-    dtype = jax.tree.leaves(given.centre)[0].dtype
-    return jax.eval_shape(lambda g: limits_at(region, g, jnp.zeros(n, dtype)), given).shape[0]
+    zero = jnp.zeros(n, jax.tree.leaves(given.centre)[0].dtype)
+    of = lambda given: (plain_limits_at(region, given, zero), added_limits_at(region, given, zero))
+    plain, added = jax.eval_shape(of, given)
+    return plain.shape[0], added.shape[0]
 
 
 def _coordinates(pose: Any, y: jax.Array) -> jax.Array:

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pk_jax.analysis.measures import small_det
 from pk_jax.analysis.quadrature import gauss
 from pk_jax.analysis.ray_rules import Problem, values_at
 from pk_jax.analysis.region import Given, joints_at, limits_at
+from pk_jax.geometry.matrices import small_det
 from pk_jax.geometry.poses import retract, tangent_size, tangent_zero
 from pk_jax.kinematics import newton
 from pk_jax.kinematics.batching import where

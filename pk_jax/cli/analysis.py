@@ -153,24 +153,78 @@ def _certify(options: argparse.Namespace) -> int:
 
 
 def add_workspace(command: Command) -> None:
-    sub = command("workspace", _workspace, "GII, GRI and SUI of a 2-RPR or 2-RRR")
+    sub = command(
+        "workspace",
+        _workspace,
+        "integrals over the workspace: GII, GRI, SUI of a 2-RPR or 2-RRR, any index of any",
+    )
     sub.add_argument("mechanism", help="2-rpr, 2-rrr, a catalogue entry (see: pk-jax list) or a TOML file")
     sub.add_argument("--half-base", type=float, default=1.0, help="R (default: 1)")
     sub.add_argument("--l-min", type=float, help="least distance from a base joint to the end point")
     sub.add_argument("--l-max", type=float, help="greatest distance (default: l_min + 2 R, eq. 20)")
     sub.add_argument("--proximal", type=float, help="driven link of the 2-rrr (default: R)")
-    sub.add_argument("--rule", default="gauss", help="gauss, midpoint or paper (default: gauss)")
+    sub.add_argument(
+        "--rule",
+        help="gauss, midpoint or paper (default: gauss); with --index strokes, panels or rays",
+    )
     sub.add_argument("--nodes", type=int, nargs=2, metavar=("OUTER", "INNER"), help="nodes of the rule")
+    sub.add_argument(
+        "--index",
+        action="append",
+        metavar="NAME",
+        help="volume, integral and mean of a local index, of any mechanism with limits: frobenius_isotropy, "
+        "isotropy, resistivity, manipulability, stiffness, clearance, singularity_distance; again for more",
+    )
+    sub.add_argument(
+        "--range",
+        action="append",
+        default=[],
+        metavar="NAME=LOWER:UPPER",
+        help="with --index: limits of a coordinate, rad or the mechanism's unit; may be given again",
+    )
+    sub.add_argument("--axes", metavar="NAME,...", help="with --index: coordinates that vary (default: all)")
+    sub.add_argument("--clearance", type=float, help="with --index: least clearance of singularities")
+    sub.add_argument("--rays", type=int, help="with --index: directions in each set, or angles")
 
 
 def _workspace(options: argparse.Namespace) -> int:
+    if options.index is None:
+        for name in ("axes", "clearance", "rays"):
+            if getattr(options, name) is not None:
+                raise ValueError(f"--{name} is for --index")
+        if options.range:
+            raise ValueError("--range is for --index")
+        return _paper_indices(options)
+    if options.nodes is not None:
+        raise ValueError("--nodes is for GII, GRI and SUI; with --index say --rays")
+    progress = begin()
+    import pk_jax as pk
+    from pk_jax.files import limits
+    from pk_jax.files.named import Named, named_mechanism
+
+    if options.mechanism in ("2-rpr", "2-rrr"):
+        named = Named(_mechanism(options), options.mechanism, "1", 1.0, None)
+    else:
+        _mechanism(options)  # which takes no lengths
+        named = named_mechanism(options.mechanism)
+    progress.say("integrating")
+    found = limits.integral_of(
+        named, options.index, options.range, options.axes, options.clearance, options.rule, options.rays
+    )
+    progress.close()
+    print(limits.integral_text(named, options.index, found))
+    return 0 if int(found.status) == pk.Status.OK else NUMERICAL
+
+
+def _paper_indices(options: argparse.Namespace) -> int:
     begin()
     import pk_jax as pk
 
     mech = _mechanism(options)
     nodes = None if options.nodes is None else tuple(options.nodes)
-    found = pk.workspace_indices(mech, options.rule, nodes)
-    print(f"{mech!r}\nrule {options.rule}")
+    rule = options.rule or "gauss"
+    found = pk.workspace_indices(mech, rule, nodes)
+    print(f"{mech!r}\nrule {rule}")
     for name in ("gii", "gri", "sui", "area"):
         error = float(getattr(found.error, name))
         estimate = f"  +- {error:.1e}" if error == error else ""

@@ -14,6 +14,7 @@ _VERBS = (  # in the order of --help
     papers.add_reproduce,
     analysis.add_workspace,
     design.add_optimize,
+    design.add_merge,
     kinematics.add_forward,
     kinematics.add_inverse,
     kinematics.add_modes,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import itertools
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -233,7 +235,9 @@ def indices_and_slopes(space: DesignSpace, vectors: Any) -> tuple[np.ndarray, np
     """
     vectors = np.asarray(vectors)
     filled = np.concatenate([vectors, np.tile(vectors[-1], (-len(vectors) % BLOCK, 1))])
-    parts = [_block(space, filled[i : i + BLOCK]) for i in range(0, len(filled), BLOCK)]
+    blocks = filled.reshape(-1, BLOCK, vectors.shape[1])
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # a block keeps one core busy, no more
+        parts = list(pool.map(lambda block: jax.device_get(_block(space, block)), blocks))
     indices, slopes = (np.concatenate(part)[: len(vectors)] for part in zip(*parts, strict=True))
     return indices, slopes
 

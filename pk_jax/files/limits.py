@@ -9,12 +9,14 @@ import numpy as np
 
 from pk_jax.analysis.boxes import Certificate
 from pk_jax.analysis.certificate import certify_confined, certify_regular
+from pk_jax.analysis.integral import WorkspaceIntegral, workspace_integral
 from pk_jax.analysis.slices import coordinate_names
 from pk_jax.analysis.workspace_map import ANY, Travel, WorkspaceMap, travel, workspace_map
 from pk_jax.files.named import Named
 from pk_jax.files.options import ranges_of, signs_of, unit_name, units_of
 from pk_jax.files.rows_file import format_rows
 from pk_jax.files.stream import free_columns, free_numbers
+from pk_jax.status import Status
 
 BEYOND = 1.5  # times the travel: how far a map goes where no range is given
 
@@ -112,4 +114,39 @@ def certificates_text(named: Named, found: dict[str, Certificate], at_least: flo
     }
     for what, each in found.items():
         lines.append(f"{'PROVED' if each.is_proved else 'NOT PROVED'}: {says[what]} ({each.boxes} boxes)")
+    return "\n".join(lines)
+
+
+def integral_of(
+    named: Named,
+    indices: Sequence[str],
+    ranges: Sequence[str],
+    axes: str | None,
+    clearance: float | None,
+    rule: str | None,
+    rays: int | None,
+) -> WorkspaceIntegral:
+    """Volume of the workspace, and integrals of the indices over it, as the command line says."""
+    return workspace_integral(
+        named.mechanism,
+        tuple(indices),
+        axes=axes,
+        within=ranges_of(named, ranges) or None,
+        clearance=clearance,
+        rule=rule,
+        rays=rays,
+    )
+
+
+def integral_text(named: Named, indices: Sequence[str], found: WorkspaceIntegral) -> str:
+    """Every value with its estimated error, and which rays were not what they should be."""
+    status = Status(int(found.status))
+    lines = [f"{named.name}: {status.name}, lengths in {'its own unit' if named.unit == '1' else 'm'}"]
+    entry = lambda name, value, error: f"{name:32}{float(value):.12g}  +- {float(error):.1e}"
+    lines.append(entry("volume", found.volume, found.error.volume))
+    for k, name in enumerate(indices):
+        lines.append(entry(f"integral of {name}", found.integral[k], found.error.integral[k]))
+        lines.append(entry(f"mean of {name}", found.mean[k], found.error.mean[k]))
+    counts = {name: int(value) for name, value in found.counts._asdict().items()}
+    lines.append(", ".join(f"{name} {value}" for name, value in counts.items() if value))
     return "\n".join(lines)

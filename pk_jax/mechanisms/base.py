@@ -125,6 +125,10 @@ class Mechanism(abc.ABC):
         """Least and greatest value of each of the free joints, of mechanisms that have some. -> (k, 2)"""
         raise ValueError(f"{type(self).__name__} has free_joints and must define free_range()")
 
+    def prepared(self) -> Mechanism:
+        """The same mechanism with what follows from its geometry alone computed once, for long integrals."""
+        return self
+
     @abc.abstractmethod
     def skeleton(self, pose: Any, joints: jax.Array) -> Skeleton:
         """What to draw."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ from jax import lax
 
 from pk_jax import checks
 from pk_jax.geometry import rotations, safe
+from pk_jax.geometry.matrices import least_direction, small_inverse
 from pk_jax.geometry.poses import place
 from pk_jax.geometry.se3 import SE3
 from pk_jax.mechanisms.base import LegMechanism, Skeleton
@@ -150,6 +153,12 @@ class Stewart(LegMechanism):
                 found["platform_cone"] = jnp.sum(seen * on_platform, axis=1) - jnp.cos(self.platform_cone)
         return found
 
+    def prepared(self) -> Stewart:
+        """With the axes of its cones."""
+        if self.cone_axes is not None or (self.base_cone is None and self.platform_cone is None):
+            return self
+        return dataclasses.replace(self, cone_axes=self._axes())
+
     def skeleton(self, pose: SE3, joints: jax.Array) -> Skeleton:
         rows = self.base.shape[0]
         points = jnp.concatenate([self.base, place(pose, self.platform)])
@@ -223,13 +232,13 @@ def _clearance(mech: Stewart, pose: SE3) -> jax.Array:
     rows = mech.linearize(pose, mech.inverse(pose))[1][:LEGS]
     rows = rows * jnp.where(jnp.arange(6) < 3, mech.length(), 1)
     rows = rows / jnp.linalg.norm(rows, axis=1, keepdims=True)
-    size = jnp.linalg.norm(jnp.linalg.inv(rows))
+    size = jnp.linalg.norm(small_inverse(rows))
     return jnp.where(jnp.isfinite(size), 1 / size, 0)
 
 
 def _normal(points: jax.Array) -> jax.Array:
     """Unit normal of the plane nearest to centred points, upwards. -> (3,)"""
-    normal = jnp.linalg.svd(points)[2][2]
+    normal = least_direction(points)
     steepest = normal[jnp.argmax(jnp.abs(normal))]
     upward = jnp.where(jnp.abs(normal[2]) > 1e-6, normal[2], steepest)
     return normal * jnp.sign(upward)

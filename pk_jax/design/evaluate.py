@@ -16,6 +16,7 @@ from pk_jax.design.problem import DesignProblem
 from pk_jax.status import Status
 
 BLOCK = 8  # designs that one call of the compiled function takes
+FEW = 8  # variables, of which the derivatives are best taken one by one
 
 
 class DesignValues(NamedTuple):
@@ -86,10 +87,10 @@ def _block(problem: DesignProblem, slopes: bool, vectors: jax.Array) -> Any:
 
     def one(vector):
         twice = lambda vector: (problem.measure(vector),) * 2
-        if problem.objective_count + len(problem.constraint_names) > 2 * len(vector):
-            derivatives, values = jax.jacfwd(twice, has_aux=True)(vector)
-        else:
-            derivatives, values = jax.jacrev(twice, has_aux=True)(vector)
+        answers = problem.objective_count + len(problem.constraint_names)
+        by_columns = len(vector) <= max(FEW, 2 * answers)
+        jacobian = jax.jacfwd if by_columns else jax.jacrev
+        derivatives, values = jacobian(twice, has_aux=True)(vector)
         return (*values, *derivatives)
 
     return jax.lax.map(one, vectors)

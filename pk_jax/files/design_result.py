@@ -55,7 +55,7 @@ def result_text(run: RunFile, design: OptimizedDesign) -> str:
     feasible = int(np.isfinite(design.values).sum())
     lines = [f"{run.problem.name}: {goal['measure']} {goal['index']} over the {goal['over']}"]
     for name, value in zip(run.problem.entries, design.vector, strict=True):
-        lines.append(f"{name:11}{value:.9g}")
+        lines.append(f"{name:22}{value:.9g}")
     lines.append(f"value      {design.value:.9g}")
     for name in design.active:
         lines.append(f"active     {name}, multiplier {design.multipliers[name]:.9g}")

@@ -1,6 +1,8 @@
 """Every test runs in float64; those about float32 say so themselves."""
 
+import gc
 import os
+from pathlib import Path
 
 import jax
 import pytest
@@ -36,6 +38,19 @@ def run(capsys, monkeypatch):
         return code, shown.out, shown.err
 
     return run
+
+
+MOST_MAPS = 20_000  # of memory, of the 65,530 that Linux lets a process have; every compiled program takes some
+
+
+@pytest.fixture(scope="module", autouse=True)
+def programs_do_not_pile_up():
+    """A process that has compiled some thousand programs crashes in the compiler for want of maps."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="module")

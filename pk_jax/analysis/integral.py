@@ -27,6 +27,8 @@ from pk_jax.status import Status
 _CELLS = {2: 64, 3: 64}
 _DETAIL = {2: (16, 6, 24), 3: (12, 6, 12)}  # slots, intervals, halvings
 RULES = ("strokes", "panels", "rays")
+SAFETY = 4.0  # times the difference to a coarser rule
+DOUBTFUL = 0.1  # error of a derivative over the greatest one, from which on derivatives are refused
 MOST_GRAZING = 0.05  # share of tangent rays beyond which a rule of many rays is not believed
 # Student's factors for a two-sided 95 % of the mean of r values, r - 1 = 1 .. 15
 _STUDENT = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23, 2.20, 2.18, 2.16, 2.14, 2.13)
@@ -85,7 +87,8 @@ def workspace_integral(
 ) -> WorkspaceIntegral:
     """Volume of the workspace, and integral and mean of local indices over it. Differentiable in `mech`.
 
-    The workspace is every pose with all margins >= 0, in one working mode, connected to home or not.
+    The workspace is every pose with all margins >= 0, in one working mode, connected to home or not; by the
+    rule "strokes" those of home's assembly mode.
     Volumes are in the mechanism's unit of length and radians; rotations in space by Haar's measure.
 
     index:      "frobenius_isotropy" (smooth, for optimization), "isotropy" (1/kappa), "resistivity",
@@ -147,6 +150,7 @@ class IntegralGradient(NamedTuple):
     integral: jax.Array  # (n,), or (f, n)
     mean: jax.Array
     error: Errors  # of these
+    status: jax.Array  # () Status: that of the value, or INCOMPLETE: errors too large, derivatives are NaN
 
 
 def integral_gradient(mechanism: Any, vector: Any, index: Any = "frobenius_isotropy", **options: Any):
@@ -156,6 +160,8 @@ def integral_gradient(mechanism: Any, vector: Any, index: Any = "frobenius_isotr
     options:    of `workspace_integral`; the rule must be given for more than two freedoms
 
     The errors are those of the derivatives, estimated as those of the values are, and apart from them.
+    Derivatives are refused where an error exceeds a tenth of the greatest one. A `clearance` meets limits of
+    reach at cusps, next to which derivatives converge slowly: their errors say so.
     """
     vector = checks.real_array("vector", vector)
     checks.has_shape("vector", vector, (None,))
@@ -170,10 +176,25 @@ def integral_gradient(mechanism: Any, vector: Any, index: Any = "frobenius_isotr
     is_spread = options.get("rule") == "rays"
     parts = [slopes[:, 0], slopes[:, 1:], mean_slopes]
     best, errors = zip(*(_judged(part, is_spread) for part in parts), strict=True)
+    is_good = jnp.all(jnp.stack([_is_sure(*each) for each in zip(best, errors, strict=True)]))
+    status = jnp.where(is_good | (found.status != Status.OK), found.status, Status.INCOMPLETE)
+    best = [jnp.where(status == Status.OK, each, jnp.nan) for each in best]
     flat = (lambda x: x[0]) if is_single else (lambda x: x)
     return IntegralGradient(
-        found, best[0], flat(best[1]), flat(best[2]), Errors(errors[0], flat(errors[1]), flat(errors[2]))
+        found,
+        best[0],
+        flat(best[1]),
+        flat(best[2]),
+        Errors(errors[0], flat(errors[1]), flat(errors[2])),
+        status,
     )
+
+
+def _is_sure(slopes: jax.Array, errors: jax.Array) -> jax.Array:
+    """Whether derivatives (..., n) are known well enough; they are where all are zero. -> ()"""
+    greatest = jnp.max(jnp.abs(slopes), axis=-1, initial=0)
+    tiny = 1e3 * jnp.finfo(slopes.dtype).eps
+    return jnp.all(jnp.max(errors, axis=-1, initial=0) <= DOUBTFUL * greatest + tiny)  # NaN compares False
 
 
 class _Options:
@@ -252,7 +273,8 @@ def _plan(given, region, index, rule, nodes, rays, replicates, cells) -> _Plan:
         raise ValueError(f"rule must be one of {', '.join(RULES)}, got {rule!r}")
     strokes = stroke_rule.count_strokes(given) if region.axes is None else 0
     if rule is None:
-        rule = "panels" if n == 2 else "strokes" if strokes == n else "rays"
+        is_box = strokes == n and given.mech.joints_are_distances
+        rule = "panels" if n == 2 else "strokes" if is_box else "rays"
     if rule == "panels" and n != 2:
         raise ValueError(f"rule 'panels' is for two coordinates that vary, got {n}")
     if rule == "strokes" and strokes != n:
@@ -347,5 +369,6 @@ def _judged(values: jax.Array, is_spread: bool) -> tuple[jax.Array, jax.Array]:
         best = jnp.mean(values, axis=0)
         spread = jnp.std(lax.stop_gradient(values), axis=0, ddof=1)
         return best, _STUDENT[count - 2] * spread / math.sqrt(count) + roundoff * jnp.abs(best)
-    best = values[0]
-    return best, jnp.abs(lax.stop_gradient(values[0] - values[1])) + roundoff * jnp.abs(best)
+    best = values[0]  # where convergence is slow, the difference is only a part of the error
+    difference = jnp.abs(lax.stop_gradient(values[0] - values[1]))
+    return best, SAFETY * difference + roundoff * jnp.abs(best)

@@ -40,7 +40,7 @@ def run(capsys, monkeypatch):
     return run
 
 
-MOST_MAPS = 20_000  # of memory, of the 65,530 that Linux lets a process have; every compiled program takes some
+MOST_MAPS = 20_000  # of memory, of the 65,530 of a process on Linux; every compiled program takes some
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -15,7 +15,15 @@ SCRIPTS = sorted((ROOT / "notebooks").glob("*.py"))
 LARGEST = 1_500_000  # bytes of an .ipynb
 CELL = re.compile(r"^# %%(?P<markdown> \[markdown\])?$", re.MULTILINE)
 
+# a minute each: they are run by `make soak`, and whenever they are executed anew
+LONG = ("01_two_dof_workspace", "03_screws_and_singularities", "04_casing_oscillator")
+
 EVERY = pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+IN_TURN = pytest.mark.parametrize(
+    "script",
+    [pytest.param(path, marks=pytest.mark.soak) if path.stem in LONG else path for path in SCRIPTS],
+    ids=lambda path: path.stem,
+)
 
 
 def cells_of(text):
@@ -52,7 +60,7 @@ def test_there_are_notebooks():
     assert {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")} == {path.stem for path in SCRIPTS}
 
 
-@EVERY
+@IN_TURN
 def test_it_runs_as_a_script_without_warnings(script, tmp_path):
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     settings = {"JAX_PLATFORMS": "cpu", "MPLBACKEND": "Agg", "PYTHONPATH": os.pathsep.join(paths)}

@@ -318,7 +318,7 @@ class Case(NamedTuple):
 CASES = {
     "five_bar": Case("five-bar, least 1/kappa over a rectangle", five_bar_rectangle, 45, 5, 3.0),
     "planar": Case("3-RRR, least clearance over a disc", planar_disc, 45, 5, 3.0),
-    "stewart": Case("Stewart, isotropy integrated over the workspace", stewart_workspace, 24, 5, 60.0),
+    "stewart": Case("Stewart, isotropy integrated over the workspace", stewart_workspace, 24, 5, 25.0),
 }
 
 

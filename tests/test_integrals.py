@@ -356,6 +356,22 @@ def test_slopes_with_clearance_are_those_of_differences_to_their_own_errors(name
     assert name == "cusps" or np.max(found.error.volume / np.abs(found.volume)) < 1e-5
 
 
+def test_options_are_told_apart_by_their_last_digit():
+    """They are a static argument: taken for the same, a cached program would answer for others."""
+    same = lambda a, b: integral._Options(a) == integral._Options(b)
+    about = np.array([0.1, 0.123456789])
+    assert same({"about": about, "clearance": 0.3}, {"about": about.copy(), "clearance": 0.3})
+    assert not same({"clearance": 0.123456789}, {"clearance": 0.12345678901})
+    assert not same({"about": about}, {"about": about + 1e-16})
+    assert not same({"rays": 64}, {"nodes": 64})
+
+
+@pytest.mark.soak
+def test_any_number_of_rays_will_do():
+    found = integral_gradient(two_rpr, [1.0, 2.08], (), rays=300, nodes=12)  # no multiple of a block
+    np.testing.assert_allclose(found.volume[1], 2.17622729, atol=1e-6)
+
+
 def test_slopes_that_are_not_known_well_are_refused():
     slopes = jnp.array([[4.0, -1.0], [0.0, 0.0]])
     errors = jnp.array([[0.39, 0.1], [0.0, 0.0]])

@@ -157,7 +157,7 @@ def integral_gradient(mechanism: Any, vector: Any, index: Any = "frobenius_isotr
     """`workspace_integral` of mechanism(vector) and its derivatives in vector (n,). -> IntegralGradient
 
     mechanism:  function (n,) -> Mechanism, traceable
-    options:    of `workspace_integral`; the rule must be given for more than two freedoms
+    options:    of `workspace_integral`; without a rule panels for two freedoms, else rays
 
     The errors are those of the derivatives, estimated as those of the values are, and apart from them.
     Derivatives are refused where an error exceeds a tenth of the greatest one. A `clearance` meets limits of
@@ -173,7 +173,7 @@ def integral_gradient(mechanism: Any, vector: Any, index: Any = "frobenius_isotr
     values = found.replicates
     means = values[:, 1:] / values[:, :1]
     mean_slopes = (slopes[:, 1:] - means[..., None] * slopes[:, :1]) / values[:, :1, None]
-    is_spread = options.get("rule") == "rays"
+    is_spread = len(values) > 2  # by sets of rays
     parts = [slopes[:, 0], slopes[:, 1:], mean_slopes]
     best, errors = zip(*(_judged(part, is_spread) for part in parts), strict=True)
     is_good = jnp.all(jnp.stack([_is_sure(*each) for each in zip(best, errors, strict=True)]))
@@ -198,18 +198,26 @@ def _is_sure(slopes: jax.Array, errors: jax.Array) -> jax.Array:
 
 
 class _Options:
-    """Options of `workspace_integral` as one static argument: the same where they print the same."""
+    """Options of `workspace_integral` as one static argument, compared by all their digits."""
 
     def __init__(self, options: dict[str, Any]) -> None:
         self.options = options
-        hashed = [v if callable(v) else repr(jax.tree.map(np.asarray, v)) for v in options.values()]
-        self.key = (*options, *hashed)
+        leaves, tree = jax.tree.flatten(options)
+        self.key = (tree, *(_frozen(leaf) for leaf in leaves))
 
     def __eq__(self, other: Any) -> bool:
         return self.key == other.key
 
     def __hash__(self) -> int:
         return hash(self.key)
+
+
+def _frozen(leaf: Any) -> Any:
+    """An array by its bytes, anything else as it is."""
+    if isinstance(leaf, jax.Array | np.ndarray):
+        array = np.asarray(leaf)
+        return array.shape, array.dtype.str, array.tobytes()
+    return type(leaf), leaf
 
 
 @partial(jax.jit, static_argnums=(0, 2, 3))

@@ -8,6 +8,7 @@ others.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -127,13 +128,16 @@ INDICES: dict[str, Measure] = {
 }
 
 
-def measure_of(index: Any) -> Measure:
-    """A local index by name, or a function of (mech, pose, joints) as it is; ValueError for others."""
+def measure_of(index: Any, length: float | None = None) -> Measure:
+    """A local index by name, lengths over `length`; a function of (mech, pose, joints) as it is.
+
+    ValueError for others.
+    """
     if callable(index):
         return index
-    if index not in INDICES:
+    if not isinstance(index, str) or index not in INDICES:
         raise ValueError(f"index must be a function or one of {', '.join(INDICES)}, got {index!r}")
-    return INDICES[index]
+    return INDICES[index] if length is None else partial(INDICES[index], length=length)
 
 
 def names_of(indices: Any) -> tuple[Any, ...]:

@@ -58,16 +58,8 @@ def values_at(problem: Problem, given: Given, pose) -> jax.Array:
     """1 and every integrand at a pose. -> (1 + f,)"""
     joints = joints_at(given, pose)
     one = jnp.ones((), joints.dtype)
-    length = problem.region.length
-    found = []
-    for index in problem.indices:
-        measure = measure_of(index)
-        value = (
-            measure(given.mech, pose, joints)
-            if callable(index)
-            else measure(given.mech, pose, joints, length)
-        )
-        found.append(jnp.ravel(jnp.asarray(value, joints.dtype)))
+    measures = [measure_of(index, problem.region.length) for index in problem.indices]
+    found = [jnp.ravel(jnp.asarray(of(given.mech, pose, joints), joints.dtype)) for of in measures]
     return jnp.concatenate([one[None], *found])
 
 
@@ -215,6 +207,7 @@ def _breaks(problem: Problem, given: Given, toward, angles: int) -> tuple[jax.Ar
         return jnp.concatenate([found.lower_by, found.upper_by]).T
 
     block = min(BLOCK, angles)
+    angles += -angles % block
     labels_of = lambda theta: lax.map(labels_at, theta.reshape(-1, block)).reshape(len(theta), -1)
     start = 2 * np.pi * 0.381966 / angles  # no symmetry of a mechanism lies there
     theta = start + 2 * jnp.pi * jnp.arange(angles, dtype=dtype) / angles

@@ -49,7 +49,7 @@ def least_over(
     branch:  working mode; default: the mechanism's own
     -> function Mechanism -> (k,), 0 with derivative 0 at poses out of reach: keep them in by `margins_over`
     """
-    measure, length = measure_of(index), length_of(length)
+    measure = measure_of(index, length_of(length))
     poses = _batch(poses)
 
     def objective(mech: Mechanism) -> jax.Array:
@@ -60,8 +60,7 @@ def least_over(
             is_reached = all_finite(found)
             pose = where(is_reached, pose, home)  # what is differentiated never sees a limit
             joints = jnp.where(is_reached, mech.inverse(pose, branch), at_home)
-            value = measure(mech, pose, joints) if callable(index) else measure(mech, pose, joints, length)
-            return jnp.where(is_reached, value, 0)
+            return jnp.where(is_reached, measure(mech, pose, joints), 0)
 
         return jax.vmap(one)(poses)
 

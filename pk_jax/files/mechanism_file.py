@@ -13,13 +13,10 @@ Angles are in radians whatever the unit. Numbers are scaled as decimals and roun
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import difflib
 import math
 import os
 import tomllib
-from collections.abc import Iterable, Iterator
 from decimal import Context, Decimal
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +26,7 @@ import numpy as np
 
 from pk_jax import checks
 from pk_jax.files.atomic import write_atomically
+from pk_jax.files.toml_values import choice, listed, nearest, show, told_of
 from pk_jax.mechanisms.base import Mechanism
 from pk_jax.mechanisms.casing_oscillator import CasingOscillator
 from pk_jax.mechanisms.five_bar import FiveBar
@@ -82,7 +80,7 @@ def read_mechanism_file(path: str | os.PathLike) -> MechanismFile:
     path = _path(path)
     with open(path, "rb") as file:
         content = file.read(LARGEST + 1)  # no more than that, also of a pipe or a device
-    with _told_of(path):
+    with told_of(path):
         return _parse(content)
 
 
@@ -94,7 +92,7 @@ def save_mechanism(mech: Mechanism, path: str | os.PathLike, *, unit: str = "m")
     with the path, for a mechanism that is traced, of no family of the house or not valid.
     """
     path = _path(path)
-    with _told_of(path):
+    with told_of(path):
         content = _compose(mech, unit).encode()
         _parse(content)  # what would be refused is not written
     write_atomically(path, content)
@@ -102,17 +100,6 @@ def save_mechanism(mech: Mechanism, path: str | os.PathLike, *, unit: str = "m")
 
 def _path(path: str | os.PathLike) -> Path:
     return Path(os.path.expanduser(path))  # that of pathlib raises where there is no such user
-
-
-@contextlib.contextmanager
-def _told_of(path: Path) -> Iterator[None]:
-    """What is wrong, as one line that starts with the path."""
-    try:
-        yield
-    except RecursionError:
-        raise ValueError(f"{path}: values must not be nested that deeply") from None
-    except ValueError as error:
-        raise ValueError(f"{path}: {_cut(' '.join(str(error).split()), 400)}") from None
 
 
 # Reading
@@ -133,19 +120,19 @@ def _parse(content: bytes) -> MechanismFile:
         raise ValueError(f"invalid TOML: {error}") from None
     classes = list(FAMILIES.values())
     if "family" in table:
-        classes = [FAMILIES[_choice("family", table["family"], FAMILIES)]]
+        classes = [FAMILIES[choice("family", table["family"], FAMILIES)]]
     fields = {name: is_needed for cls in classes for name, is_needed in _fields(cls).items()}
     known = ("family", "unit", *COMMENTS, *fields)
     for key in table:
         if key not in known:
-            raise ValueError(f"unknown key {_show(key)}{_nearest(key, known)}; there are {', '.join(known)}")
+            raise ValueError(f"unknown key {show(key)}{nearest(key, known)}; there are {', '.join(known)}")
     for key, choices in (("family", FAMILIES), ("unit", UNITS)):
         if key not in table:
-            raise ValueError(f"missing key {key!r}, one of {_listed(choices)}")
-    unit = _choice("unit", table["unit"], UNITS)
+            raise ValueError(f"missing key {key!r}, one of {listed(choices)}")
+    unit = choice("unit", table["unit"], UNITS)
     for key in COMMENTS:
         if not isinstance(table.get(key, ""), str):
-            raise ValueError(f"{key} must be a string, got {_show(table[key])}")
+            raise ValueError(f"{key} must be a string, got {show(table[key])}")
     needed = [name for name, is_needed in fields.items() if is_needed]
     for key in needed:
         if key not in table:
@@ -184,11 +171,11 @@ def _array(key: str, value: Any, metres: Decimal) -> np.ndarray:
     try:
         array = np.asarray(numbers, dtype=np.float64)
     except ValueError:
-        raise ValueError(f"{key} must have rows of one length, got {_show(value)}") from None
+        raise ValueError(f"{key} must have rows of one length, got {show(value)}") from None
     with np.errstate(over="ignore"):  # what float32 cannot hold is refused as not finite
         array = array.astype(jnp.result_type(float))
     if key in ANGLES and np.any(array > array.dtype.type(np.pi)):
-        raise ValueError(f"{key} must be at most pi, got {_show(value)}: radians, not degrees?")
+        raise ValueError(f"{key} must be at most pi, got {show(value)}: radians, not degrees?")
     return array
 
 
@@ -197,7 +184,7 @@ def _numbers(key: str, value: Any, scale: Decimal) -> Any:
         return [_numbers(f"{key}[{i}]", item, scale) for i, item in enumerate(value)]
     if isinstance(value, bool) or not isinstance(value, int | float | Decimal):
         wanted = "a number" if "[" in key else "a number or an array of numbers"
-        raise ValueError(f"{key} must be {wanted}, got {_show(value)}")
+        raise ValueError(f"{key} must be {wanted}, got {show(value)}")
     if isinstance(value, int):
         value = Decimal(value) if value.bit_length() <= 1024 else math.inf
     number = float(_READ.multiply(value, scale)) if isinstance(value, Decimal) else value  # 0, inf, nan
@@ -206,37 +193,11 @@ def _numbers(key: str, value: Any, scale: Decimal) -> Any:
     return number
 
 
-def _choice(key: str, value: Any, choices: Iterable[str]) -> str:
-    if not isinstance(value, str) or value not in choices:
-        raise ValueError(
-            f"{key} must be one of {_listed(choices)}, got {_show(value)}{_nearest(value, choices)}"
-        )
-    return value
-
-
-def _listed(choices: Iterable[str]) -> str:
-    return ", ".join(f'"{choice}"' for choice in choices)
-
-
-def _nearest(word: Any, words: Iterable[str]) -> str:
-    lowered = {known.lower(): known for known in words}
-    close = difflib.get_close_matches(_cut(str(word).lower(), 60), lowered, n=1)
-    return f" (did you mean {lowered[close[0]]!r}?)" if close else ""
-
-
-def _show(value: Any) -> str:
-    return _cut(repr(value), 60)
-
-
-def _cut(text: str, most: int) -> str:
-    return text if len(text) <= most else text[: most - 3] + "..."
-
-
 # Writing
 
 
 def _compose(mech: Mechanism, unit: str) -> str:
-    unit = _choice("unit", unit, UNITS)
+    unit = choice("unit", unit, UNITS)
     family = type(mech).__name__
     if FAMILIES.get(family) is not type(mech):
         raise ValueError(f"only a mechanism of the house can be saved, {', '.join(FAMILIES)}, got {family}")

@@ -5,8 +5,11 @@ Batched calls of LAPACK from several places of one program can block each other 
 
 from __future__ import annotations
 
+import itertools
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 
 def small_inverse(matrix: jax.Array) -> jax.Array:
@@ -45,12 +48,20 @@ def orthonormal(matrix: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 
 def small_det(matrix: jax.Array) -> jax.Array:
-    """Determinant of a small square matrix. -> ()"""
-    if len(matrix) == 2:
+    """Determinant of a small square matrix; above three rows by Laplace's expansion in two blocks. -> ()"""
+    n = len(matrix)
+    if n == 1:
+        return matrix[0, 0]
+    if n == 2:
         return matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
-    if len(matrix) == 3:
+    if n == 3:
         return jnp.dot(matrix[0], jnp.cross(matrix[1], matrix[2]))
-    return jnp.linalg.det(matrix)
+    half = n // 2
+    chosen = np.array(list(itertools.combinations(range(n), half)))
+    others = np.array([[j for j in range(n) if j not in row] for row in chosen])
+    signs = (-1.0) ** (chosen.sum(axis=1) - half * (half - 1) // 2)
+    minors = lambda rows, columns: jax.vmap(lambda own: small_det(rows[:, own]))(columns)
+    return jnp.sum(signs * minors(matrix[:half], chosen) * minors(matrix[half:], others))
 
 
 def least_direction(points: jax.Array) -> jax.Array:

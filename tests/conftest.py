@@ -55,8 +55,13 @@ def programs_do_not_pile_up():
 
 @pytest.fixture(scope="module")
 def compiled_in_haste():
-    """For files that mostly compile: without most optimizations XLA is sooner done, and computes the same."""
+    """For files that mostly compile: without most optimizations XLA is sooner done, and computes the same.
+
+    To roundoff: no program may stay for the next file, which may compare bits.
+    """
     before = jax.config.read("jax_disable_most_optimizations")
+    jax.clear_caches()
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", before)
+    jax.clear_caches()

@@ -379,6 +379,7 @@ def test_a_search_finds_both_poses_of_a_delta():
     assert modes.tally()["DUPLICATE"] > 100 and len(modes.fates) == 256
 
 
+@pytest.mark.soak
 def test_a_search_finds_what_a_closed_form_knows():
     """The outsider's 3-RPR has no closed form; ours has."""
     mech = three_rpr()

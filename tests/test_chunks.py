@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from pk_jax.analysis.chunks import ROWS_AT_ONCE, forward_mode
 
@@ -28,6 +29,7 @@ def test_values_and_derivatives_of_every_kind():
         np.testing.assert_allclose(transform(wrapped)(p), transform(plain)(p), rtol=1e-13)
 
 
+@pytest.mark.soak
 def test_batches_of_every_size_equal_a_loop():
     for count in (1, 2, ROWS_AT_ONCE, ROWS_AT_ONCE + 1, len(ROWS)):
         rows = ROWS[:count]

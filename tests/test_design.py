@@ -44,6 +44,7 @@ def test_mechanisms_of_a_space_satisfy_equation_22():
     np.testing.assert_allclose([mech.l_min, mech.l_max], [1.01, 3.01])
 
 
+@pytest.mark.soak
 def test_the_gradient_passes_through_the_mechanism_at_la_equal_r():
     """d gri / dv at v = 0 is not 0, though d la / dv is: the mechanism carries v."""
     slope = jax.jit(jax.grad(lambda v: pk.workspace_indices(RRR.mechanism(jnp.stack([1.7, v]))).gri))(0.0)

@@ -11,6 +11,8 @@ import pk_jax as pk
 from pk_jax import Status
 from pk_jax.geometry.poses import difference
 
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
 SEMI = pk.catalogued("semi-regular-stewart")
 NAN, INF = np.nan, np.inf
 RANGES = (35.0, 40.0, 0.35, 0.3)  # tilt, yaw in deg, sideways and up in base radii, all together
@@ -391,6 +393,7 @@ def test_slopes_in_the_geometry(slopes):
         np.testing.assert_allclose(mine / size, expected / size, rtol=0, atol=1e-8)
 
 
+@pytest.mark.soak
 def test_second_derivatives(slopes):
     second = jax.jit(jax.jacfwd(jax.jacfwd(coordinates, argnums=1), argnums=1))(SEMI, JOINTS[0])
     direction = np.array([0.3, -0.5, 0.2, 0.7, -0.1, 0.4])
@@ -400,6 +403,7 @@ def test_second_derivatives(slopes):
     np.testing.assert_allclose(second, np.swapaxes(second, 1, 2), rtol=0, atol=1e-11 * size)
 
 
+@pytest.mark.soak
 def test_slopes_of_least_squares():
     """With sensors that disagree a little the residual's curvature counts; where too much, the slope is 0."""
     reference = NINE_POSES[0]

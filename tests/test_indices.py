@@ -220,6 +220,7 @@ def test_parallel_distal_links_are_a_type_two_singularity():
     np.testing.assert_allclose([found.isotropy, found.resistivity], 0, atol=1e-14)
 
 
+@pytest.mark.soak
 def test_derivatives_agree_with_central_differences(gradient):
     rng = np.random.default_rng(3)
     poses = np.stack([rng.uniform(-0.9, 0.9, 6), rng.uniform(1.2, 2.2, 6)], axis=1)

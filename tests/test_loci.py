@@ -337,6 +337,7 @@ def similar_radius(phi):
     return np.sqrt(1 + SMALLER**2 - 2 * SMALLER * np.cos(phi))
 
 
+@pytest.mark.soak
 def test_similar_triangles_are_singular_on_a_circle():
     found = pk.singularity_locus(SIMILAR, at=[0, 0, 0.9], nodes=41, kinds="II")
     is_lawful(SIMILAR, found)
@@ -593,6 +594,7 @@ def test_traced_mechanisms_and_other_things_are_refused():
 # ---------------------------------------------------------------- what does not matter
 
 
+@pytest.mark.soak
 def test_where_the_whole_stands_does_not_matter():
     mech, turn, shift = RRR["asymmetric"], 0.7, np.array([0.3, -0.2])
     matrix = ring(turn + np.array([0, np.pi / 2])).T

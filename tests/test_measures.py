@@ -142,6 +142,7 @@ def test_rates_are_those_of_central_differences(name):
     assert np.max(np.abs(slopes - rates) / scale) < 1e-5
 
 
+@pytest.mark.soak
 def test_indices_do_not_see_where_the_base_stands():
     """4-RRR turned and shifted with its base; in space the nine-length platform."""
     turn, shift = pk.geometry.planar.rotation(0.7), np.array([3.0, -2.0])

@@ -15,13 +15,13 @@ SCRIPTS = sorted((ROOT / "notebooks").glob("*.py"))
 LARGEST = 1_500_000  # bytes of an .ipynb
 CELL = re.compile(r"^# %%(?P<markdown> \[markdown\])?$", re.MULTILINE)
 
-# a minute each: they are run by `make soak`, and whenever they are executed anew
-LONG = ("01_two_dof_workspace", "03_screws_and_singularities", "04_casing_oscillator")
+# about a minute each; all others are run by `make soak`, and whenever they are executed anew
+ALWAYS = ("06_assembly_modes", "08_your_own_mechanism")
 
 EVERY = pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 IN_TURN = pytest.mark.parametrize(
     "script",
-    [pytest.param(path, marks=pytest.mark.soak) if path.stem in LONG else path for path in SCRIPTS],
+    [path if path.stem in ALWAYS else pytest.param(path, marks=pytest.mark.soak) for path in SCRIPTS],
     ids=lambda path: path.stem,
 )
 

@@ -187,6 +187,7 @@ def test_extremes_of_the_indices():
     np.testing.assert_allclose(upper, [0.5213190204, 0.7829910881, 0.4515420367], rtol=1e-9)
 
 
+@pytest.mark.soak
 def test_another_optimizer_finds_nothing_better():
     bounds = pk.index_bounds(RRR)
     value = jax.jit(

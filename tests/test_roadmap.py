@@ -259,6 +259,7 @@ def test_a_mode_outside_the_limits_is_not_reached(rpr):
 # --- platforms in the plane
 
 
+@pytest.mark.soak
 def test_a_planar_platform_changes_its_mode_without_a_singularity(rpr):
     """All modes of one sign are linked; the joints of the way lead from the one to the other, and back to
     themselves: the phenomenon of Zein, Wenger and Chablat, "Non-singular assembly-mode changing motions for

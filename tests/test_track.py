@@ -107,6 +107,7 @@ def test_a_path_of_one_row():
     assert_same_pose(found.pose, take(CIRCLE, slice(1)), 1e-12)
 
 
+@pytest.mark.soak
 def test_a_path_from_a_given_start(followed):
     start = take(CIRCLE, 20)
     found = pk.track(SEMI, np.roll(PATH, -20, axis=0), start)
@@ -149,6 +150,7 @@ def test_a_path_over_the_singularity_ends_there(step, offset):
     assert np.all(np.diff(found.sigma_min[ok // 2 : ok]) < 0)
 
 
+@pytest.mark.soak
 def test_without_the_stop_newton_goes_on_to_another_pose():
     """Each row from the one before: the lengths are met at every yaw, and the pose is not the path's."""
     degrees = np.arange(80, 101.0) + 0.37

@@ -125,6 +125,7 @@ def test_two_rpr_has_converged_to_machine_precision():
         assert coarse.error.gii < 1e-10
 
 
+@pytest.mark.soak
 def test_accuracy_and_error_estimate_over_the_whole_space():
     designs = scan()
     values, errors = batch()(designs)

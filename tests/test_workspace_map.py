@@ -450,6 +450,7 @@ def test_the_carriage_of_the_best_conditioning_is_that_of_a_scan(mech):
     assert np.all(is_end) if mech is CASING else np.sum(~is_end) >= 2
 
 
+@pytest.mark.soak
 def test_a_batch_is_a_loop():
     pose, many = resolved("margin")
     for k in range(0, ROWS, 3):
@@ -501,6 +502,7 @@ def derivatives(pose, by, h, long=0.0):
     return slopes[0], (values[1:17] - values[17:]).T / (2 * h)
 
 
+@pytest.mark.soak
 def test_derivatives_of_the_best_carriage_are_those_of_differences():
     """In the pose, both radii and all strokes."""
     pose, _ = resolved("margin")

@@ -274,11 +274,13 @@ def test_five_bar_is_that_of_its_own_rule():
     found = integral_gradient(along, at, ("isotropy", "resistivity"), nodes=24)
     known = pk.workspace_indices(along(at))
     np.testing.assert_allclose(found.value.mean, [known.gii, known.gri], atol=1e-4)
+    assert found.status == Status.INCOMPLETE  # 1/kappa has edges inside: its small slopes are not known well
+    assert np.isnan(found.mean[0]).all() and np.isfinite(found.mean[1]).all() and np.isfinite(found.volume).all()
     step = 1e-4
     for i in range(2):
         ahead, behind = (pk.workspace_indices(along(at + h * np.eye(2)[i])) for h in (step, -step))
-        slope = np.array([ahead.gii - behind.gii, ahead.gri - behind.gri]) / (2 * step)
-        np.testing.assert_allclose(found.mean[:, i], slope, atol=np.max(found.error.mean[:, i]) + 1e-3)
+        slope = (ahead.gri - behind.gri) / (2 * step)
+        np.testing.assert_allclose(found.mean[1, i], slope, atol=found.error.mean[1, i] + 1e-5)
 
 
 # --- clearance
@@ -345,6 +347,9 @@ CLEARANCES = {  # one whose limit crosses those of reach plainly, one in cusps, 
 def test_slopes_with_clearance_are_those_of_differences_to_their_own_errors(name):
     make, z, options = CLEARANCES[name]
     found = integral_gradient(make, z, (), **options)
+    if name == "cusps":
+        assert found.status == Status.INCOMPLETE and np.isnan(found.volume).all()
+        return
     assert found.status == Status.OK
     value = jax.jit(lambda z: workspace_integral(make(z), (), **options).volume)
     step = 1e-4
@@ -353,7 +358,7 @@ def test_slopes_with_clearance_are_those_of_differences_to_their_own_errors(name
         difference = (8 * near - far) / (12 * step)  # of fourth order
         roundoff = found.value.error.volume / step
         assert abs(found.volume[i] - difference) <= found.error.volume[i] + roundoff + 1e-7
-    assert name == "cusps" or np.max(found.error.volume / np.abs(found.volume)) < 1e-5
+    assert np.max(found.error.volume / np.abs(found.volume)) < 1e-5
 
 
 def test_options_are_told_apart_by_their_last_digit():
@@ -375,10 +380,11 @@ def test_any_number_of_rays_will_do():
 def test_slopes_that_are_not_known_well_are_refused():
     slopes = jnp.array([[4.0, -1.0], [0.0, 0.0]])
     errors = jnp.array([[0.39, 0.1], [0.0, 0.0]])
-    assert integral._is_sure(slopes, errors)
-    assert not integral._is_sure(slopes, errors.at[0, 1].set(0.41))  # of the greatest one, not of its own
-    assert not integral._is_sure(slopes, errors.at[1, 0].set(1e-9))
-    assert not integral._is_sure(slopes.at[0, 0].set(jnp.nan), errors)
+    is_sure = lambda slopes, errors: integral._is_sure(slopes, errors).tolist()
+    assert is_sure(slopes, errors) == [True, True]
+    assert is_sure(slopes, errors.at[0, 1].set(0.41)) == [False, True]  # of the greatest one, not of its own
+    assert is_sure(slopes, errors.at[1, 0].set(1e-9)) == [True, False]
+    assert is_sure(slopes.at[0, 0].set(jnp.nan), errors) == [False, True]
 
 
 # --- 3-RRR: two coordinates, and three
@@ -441,14 +447,21 @@ def test_stewart_between_its_strokes():
     np.testing.assert_allclose(found.value.volume / 0.6**3, 0.002809379, rtol=1e-6)
     # the reference's last variable is the angle off the edge of the pair, 60 degrees less this one
     expected = np.array([-0.00379018, -0.0165156, 0.00861058, 0.00854663])
-    np.testing.assert_allclose(found.volume / 0.6**3 * [1, 1, 1, -1], expected, rtol=1e-4)
+    np.testing.assert_allclose(found.volume / 0.6**3 * np.array([1, 1, 1, -1]), expected, rtol=1e-4)
 
 
 @pytest.mark.soak
 def test_strokes_and_rays_agree_on_the_stewart():
+    """Rays count every component of the workspace: here those of other modes lie behind a margin."""
     mech = stewart(STEWART)
+    home = mech.home()[0].rotation
+
+    def of_home(mech, pose, joints):
+        cosine = (jnp.trace(pose.rotation @ home.T) - 1) / 2
+        return jnp.stack([cosine - np.cos(1.0), pose.translation[2]])
+
     strokes = workspace_integral(mech, "frobenius_isotropy", rule="strokes")
-    rays = workspace_integral(mech, "frobenius_isotropy", rule="rays")
+    rays = workspace_integral(mech, "frobenius_isotropy", rule="rays", margins=of_home)
     assert strokes.status == rays.status == Status.OK
     assert abs(strokes.volume - rays.volume) < rays.error.volume
     assert abs(strokes.mean - rays.mean) < rays.error.mean

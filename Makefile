@@ -14,7 +14,7 @@ PY := .venv/bin/python
 # Non-empty when .venv is missing, incomplete, or made from other locks, elsewhere, or by another PYTHON.
 STALE = $(shell PYTHON='$(PYTHON)' sh tools/setup_venv.sh check >/dev/null 2>&1 || echo stale)
 
-.PHONY: help setup reproduce test soak bench lint format notebooks lock clean FORCE
+.PHONY: help setup reproduce test soak bench coverage mutants lint format notebooks lock clean FORCE
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -34,6 +34,22 @@ test: .venv/.ready ## run the test suite
 
 soak: .venv/.ready ## run the long randomized tests
 	$(PY) -m pytest -m soak $(ARGS)
+
+DOOR = pk_jax/checks.py,pk_jax/files/*
+coverage: .venv/.ready ## lines and branches reached by the test suite; all of those of input and files
+	rm -f .coverage .coverage.*
+	$(PY) -m coverage run -m pytest -n 2 $(ARGS)
+	$(PY) -m coverage combine --quiet
+	$(PY) -m coverage report
+	$(PY) -m coverage report --include='$(DOOR)' --fail-under=100
+
+mutants: .venv/.ready .mutants/.ready ## change the code in 200 ways: do the tests notice? (an hour; it resumes)
+	.mutants/venv/bin/python tools/mutants.py $(ARGS)
+
+.mutants/.ready: requirements/mutants.lock
+	$(PY) -m venv --clear .mutants/venv
+	.mutants/venv/bin/python -m pip install --quiet --require-hashes -r requirements/mutants.lock
+	touch $@
 
 bench: .venv/.ready ## run every benchmark
 	@for file in benchmarks/[!_]*.py; do \
@@ -62,8 +78,9 @@ lock: .venv/.ready ## regenerate requirements/*.lock (UPGRADE=1: with newer vers
 	$(COMPILE) --extra test --extra bench --extra notebooks --extra lint \
 	  pyproject.toml requirements/build.in -o requirements/dev.lock
 	$(COMPILE) requirements/installer.in -o requirements/installer.lock
+	$(COMPILE) requirements/mutants.in -o requirements/mutants.lock
 
 clean: ## remove .venv, caches and build products (never runs/)
-	rm -rf .venv build dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .mutants build dist .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 	find . -name .ipynb_checkpoints -type d -prune -exec rm -rf {} +

@@ -116,6 +116,7 @@ if TYPE_CHECKING:
     from pk_jax.mechanisms.base import Skeleton as Skeleton
     from pk_jax.mechanisms.casing_oscillator import CasingOscillator as CasingOscillator
     from pk_jax.mechanisms.catalogue import catalogued as catalogued
+    from pk_jax.mechanisms.explicit import ExplicitMechanism as ExplicitMechanism
     from pk_jax.mechanisms.five_bar import FiveBar as FiveBar
     from pk_jax.mechanisms.planar_rpr import PlanarRPR as PlanarRPR
     from pk_jax.mechanisms.planar_rrr import PlanarRRR as PlanarRRR
@@ -299,6 +300,7 @@ _NAMES = {
     ),
     "pk_jax.mechanisms.casing_oscillator": ("CasingOscillator",),
     "pk_jax.mechanisms.catalogue": ("catalogued",),
+    "pk_jax.mechanisms.explicit": ("ExplicitMechanism",),
     "pk_jax.mechanisms.five_bar": ("FiveBar",),
     "pk_jax.mechanisms.planar_rpr": ("PlanarRPR",),
     "pk_jax.mechanisms.planar_rrr": ("PlanarRRR",),

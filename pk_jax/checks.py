@@ -7,7 +7,13 @@ Shapes are always checked. Values are checked only where they are known, that is
 from __future__ import annotations
 
 import contextlib
+import math
+import os
+import sys
 import warnings
+from collections.abc import Iterable, Mapping, Set
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -15,6 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 
 UNITS_DIFFER_BY = 100
+ROOM = 4  # times its own size: what an array of rows takes with what is made of it
+_CGROUP = "/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"  # of containers
 
 
 def is_concrete(*trees: Any) -> bool:
@@ -37,6 +45,8 @@ def is_staged() -> bool:
 
 def real_array(name: str, value: Any) -> jax.Array:
     """`value` as a floating-point array. Floats keep their precision, integers become floats."""
+    if isinstance(value, list | tuple) and not is_concrete(value):
+        value = jnp.asarray(value)  # numbers that are traced one by one
     if isinstance(value, jax.core.Tracer):
         if jnp.issubdtype(value.dtype, jnp.floating):
             return value
@@ -48,12 +58,15 @@ def real_array(name: str, value: Any) -> jax.Array:
 
 def real_numpy(name: str, value: Any) -> np.ndarray:
     """The same as a NumPy array, for values that are known."""
+    if isinstance(value, np.ma.MaskedArray):
+        value = value.astype(float).filled(np.nan)  # what is masked is no number
     try:
         array = np.asarray(value)
-    except ValueError:  # ragged nested lists
-        raise ValueError(f"{name} must be a number or a regular array, got {_short(repr(value))}") from None
+    except (ValueError, TypeError):  # ragged nested lists, keys of jax.random
+        raise ValueError(f"{name} must be a number or a regular array, got {shown(value)}") from None
+    fits(name, ROOM * array.nbytes, "take fewer rows at a time")
     if jnp.issubdtype(array.dtype, jnp.floating):
-        return array
+        return array if array.dtype.itemsize <= 8 else array.astype(np.float64)  # JAX has no longer ones
     if np.issubdtype(array.dtype, np.integer):
         return array.astype(jnp.result_type(float))
     raise ValueError(f"{name} must be real numbers, got {_short(value)} ({array.dtype})")
@@ -71,7 +84,8 @@ def has_shape(name: str, value: jax.Array, shape: tuple[int | None, ...]) -> Non
 
 def is_number(value: Any) -> bool:
     """Whether `value` is one finite real number; bools are none."""
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and np.isfinite(value)
+    is_real = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    return is_real and bool(abs(value) <= sys.float_info.max)  # NaN compares False
 
 
 def is_finite(name: str, value: jax.Array) -> None:
@@ -93,13 +107,72 @@ def warn_of_units(what: str, ratio: float, *, stacklevel: int) -> None:
 def is_count(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
     """`value` as an int within [least, most]; bools, floats and strings are refused."""
     limit = f">= {least}" if most is None else f"from {least} to {most}"
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise ValueError(f"{name} must be an integer {limit}, got {value!r}")
-    if value < least or (most is not None and value > most):
-        raise ValueError(f"{name} must be an integer {limit}, got {value}")
+    is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not is_integer or value < least or (most is not None and value > most):
+        raise ValueError(f"{name} must be an integer {limit}, got {shown(value)}")
     return int(value)
 
 
+def is_dict(name: str, value: Any) -> Mapping:
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{name} must be a dict, name -> (lower, upper), got {shown(value)}")
+    return value
+
+
+def are_devices(name: str, value: Any) -> list[jax.Device]:
+    """Devices of JAX, one at least; None: the first one of this process."""
+    found = jax.local_devices()[:1] if value is None else value
+    if not isinstance(found, list | tuple) or not all(isinstance(device, jax.Device) for device in found):
+        raise ValueError(f"{name} must be a list of jax.devices(), got {shown(value)}")
+    if not found:
+        raise ValueError(f"{name} must hold at least one")
+    return list(found)
+
+
+def is_word(name: str, value: Any, words: Iterable[str]) -> str:
+    """`value`, one of some words."""
+    if not isinstance(value, str) or value not in words:
+        raise ValueError(f"{name} must be one of {', '.join(words)}, got {shown(value)}")
+    return value
+
+
+def are_words(name: str, value: Any) -> tuple[str, ...]:
+    """Words as users give them: "x,y", or a sequence of strings."""
+    found = value.split(",") if isinstance(value, str) else value
+    if not isinstance(found, list | tuple | Set) or not all(isinstance(word, str) for word in found):
+        raise ValueError(f"{name} must be names, got {shown(value)}")
+    return tuple(found)
+
+
+def fits(what: str, size: float, hint: str) -> None:
+    """ValueError where `what`, of so many bytes with all that it takes, is more than the memory there is."""
+    if size > (most := _memory()):
+        raise ValueError(
+            f"{what} would take {size / 1e9:.3g} GB of memory, there are {most / 1e9:.3g}: {hint}"
+        )
+
+
+@lru_cache
+def _memory() -> float:
+    """Bytes that this process may have; infinite where the system does not say."""
+    found = [math.inf]
+    with contextlib.suppress(ValueError, OSError, AttributeError):
+        found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    for path in _CGROUP:
+        with contextlib.suppress(ValueError, OSError):  # it may say "max"
+            found.append(int(Path(path).read_text()))
+    return min(found)
+
+
+def shown(value: Any) -> str:
+    """Any value in a message: one short line."""
+    return _cut(repr(value))
+
+
 def _short(value: Any) -> str:
-    text = " ".join(str(np.asarray(value)).split())
+    return _cut(str(np.asarray(value)))
+
+
+def _cut(text: str) -> str:
+    text = " ".join(text.split())
     return text if len(text) <= 60 else text[:57] + "..."

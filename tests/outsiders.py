@@ -11,11 +11,64 @@ from jax import lax
 
 import pk_jax as pk
 
-_EXAMPLE = Path(__file__).parent.parent / "examples" / "delta.py"
-_spec = importlib.util.spec_from_file_location("delta_example", _EXAMPLE)
-_module = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(_module)
-Delta = _module.Delta
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def _example(stem):
+    spec = importlib.util.spec_from_file_location(f"{stem}_example", EXAMPLES / f"{stem}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+Delta = _example("delta").Delta
+ThreeRPS = _example("three_rps").ThreeRPS
+
+
+class ImplicitDelta(pk.Mechanism):
+    """The Delta without its closed-form inverse: no more than the five methods."""
+
+    base_radius: jax.Array
+    platform_radius: jax.Array
+    arm: jax.Array
+    rod: jax.Array
+
+    joint_units = (0, 0, 0)
+    rings, residual, home = Delta.rings, Delta.residual, Delta.home
+    length, skeleton = Delta.length, Delta.skeleton
+
+    def margins(self, pose, joints):
+        return {"arms": 1 - jnp.abs(joints) / (jnp.pi / 2)}
+
+
+class ConstrainedRPS(pk.Mechanism):
+    """The 3-RPS as a body in space: six equations, three lengths and three planes, for six coordinates."""
+
+    base_radius: jax.Array
+    platform_radius: jax.Array
+
+    joints_are_distances = True
+    length = ThreeRPS.length
+    out = ThreeRPS.out
+
+    def residual(self, pose, joints):
+        tips = pose.translation + self.platform_radius * self.out() @ pose.rotation.T
+        apart = tips - self.base_radius * self.out()
+        across = jnp.cross(jnp.array([0.0, 0.0, 1.0]), self.out())
+        return jnp.concatenate([jnp.sum(apart**2, axis=1) - joints**2, jnp.sum(across * tips, axis=1)])
+
+    def home(self):
+        pose = lax.stop_gradient(pk.SE3(jnp.array([0, 0, 2.0]) * self.base_radius, jnp.eye(3)))
+        tips = pose.translation + (self.platform_radius - self.base_radius) * self.out()
+        return pose, jnp.linalg.norm(tips, axis=1)
+
+    def margins(self, pose, joints):
+        return {}
+
+    def skeleton(self, pose, joints):
+        tips = pose.translation + self.platform_radius * self.out() @ pose.rotation.T
+        points = jnp.concatenate([self.base_radius * self.out(), tips])
+        return pk.Skeleton(points, ((0, 3), (1, 4), (2, 5), (3, 4), (4, 5), (5, 3)), ground=(0, 1, 2))
 
 
 class ThreeRPR(pk.LegMechanism):
@@ -93,6 +146,18 @@ class ThreeLegs(pk.LegMechanism):
 
 def delta() -> Delta:
     return Delta(base_radius=0.2, platform_radius=0.05, arm=0.35, rod=0.8)
+
+
+def implicit_delta() -> ImplicitDelta:
+    return ImplicitDelta(base_radius=0.2, platform_radius=0.05, arm=0.35, rod=0.8)
+
+
+def three_rps() -> ThreeRPS:
+    return ThreeRPS(base_radius=0.3, platform_radius=0.2, stroke=[0.5, 0.8], most_tilt=0.7)
+
+
+def constrained_rps() -> ConstrainedRPS:
+    return ConstrainedRPS(base_radius=0.3, platform_radius=0.2)
 
 
 def three_rpr() -> ThreeRPR:

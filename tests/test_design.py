@@ -52,7 +52,7 @@ def test_the_gradient_passes_through_the_mechanism_at_la_equal_r():
 
 
 def test_unknown_space():
-    with pytest.raises(ValueError, match="design space must be one of '2-rpr', '2-rrr', got '3-rrr'"):
+    with pytest.raises(ValueError, match="design space must be one of 2-rpr, 2-rrr, got '3-rrr'"):
         pk.design_space("3-rrr")
 
 

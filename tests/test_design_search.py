@@ -569,7 +569,7 @@ def test_the_worst_case_keeps_its_distance():
         ({"x": 0.0}, {}, "positive for at least one"),
         ({"x": [0.1, 0.1, 0.1]}, {}, "shape (2,)"),
         ({"x": 0.1}, {"samples": 3}, "samples must be even"),
-        ({"x": 0.1}, {"measure": "median"}, "measure must be one of 'mean', 'worst'"),
+        ({"x": 0.1}, {"measure": "median"}, "measure must be one of mean, worst"),
         ({"x": 0.1}, {"measure": "worst", "deviations": 1}, "deviations must be a number >= 0"),
     ],
 )

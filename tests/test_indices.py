@@ -272,3 +272,15 @@ def test_bad_poses_are_told(bad):
 def test_bad_branches_are_told(bad):
     with pytest.raises(ValueError, match=r"^branch must [^\n]*$"):
         pk.local_indices(ARMS, [0.2, 1.6], bad)
+
+
+@pytest.mark.soak
+def test_many_rows_of_a_platform_in_space_come_back():
+    """Batched calls of LAPACK that did not wait for one another blocked each other for good."""
+    mech = pk.catalogued("semi-regular-stewart")
+    home = mech.home()[0]
+    shifts = np.random.default_rng(0).uniform(-0.1, 0.1, (26_000, 3))
+    rotations = np.broadcast_to(home.rotation, (len(shifts), 3, 3))
+    found = pk.local_indices(mech, pk.SE3(np.asarray(home.translation) + shifts, rotations))
+    few = pk.local_indices(mech, pk.SE3(np.asarray(home.translation) + shifts[:3], rotations[:3]))
+    np.testing.assert_allclose(found.isotropy[:3], few.isotropy, rtol=1e-12)

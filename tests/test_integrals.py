@@ -275,7 +275,9 @@ def test_five_bar_is_that_of_its_own_rule():
     known = pk.workspace_indices(along(at))
     np.testing.assert_allclose(found.value.mean, [known.gii, known.gri], atol=1e-4)
     assert found.status == Status.INCOMPLETE  # 1/kappa has edges inside: its small slopes are not known well
-    assert np.isnan(found.mean[0]).all() and np.isfinite(found.mean[1]).all() and np.isfinite(found.volume).all()
+    assert (
+        np.isnan(found.mean[0]).all() and np.isfinite(found.mean[1]).all() and np.isfinite(found.volume).all()
+    )
     step = 1e-4
     for i in range(2):
         ahead, behind = (pk.workspace_indices(along(at + h * np.eye(2)[i])) for h in (step, -step))
@@ -489,7 +491,7 @@ def test_error_estimates_hold_for_random_five_bars():
 def test_error_estimates_hold_for_random_three_rrr():
     """Against four times the rays."""
     rng = np.random.default_rng(8)
-    designs = np.stack([rng.uniform(low, high, 200) for low, high in
+    designs = np.stack([rng.uniform(low, high, 40) for low, high in
                         ((0.9, 1.1), (0.2, 0.4), (0.5, 0.7), (0.5, 0.7))], axis=1)  # fmt: skip
 
     def of(rays):

@@ -15,8 +15,8 @@ SCRIPTS = sorted((ROOT / "notebooks").glob("*.py"))
 LARGEST = 1_500_000  # bytes of an .ipynb
 CELL = re.compile(r"^# %%(?P<markdown> \[markdown\])?$", re.MULTILINE)
 
-# about a minute each; all others are run by `make soak`, and whenever they are executed anew
-ALWAYS = ("06_assembly_modes", "08_your_own_mechanism")
+# all others, up to a minute each, are run by `make soak`, and whenever they are executed anew
+ALWAYS = ("08_your_own_mechanism",)
 
 EVERY = pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 IN_TURN = pytest.mark.parametrize(

@@ -475,9 +475,9 @@ def test_it_refuses_what_it_cannot_do(rpr):
     assert ask(RPR, LENGTHS, "any") == "modes must come from assembly_modes, got str"
     assert ask("any", LENGTHS, modes).startswith("connect_modes takes a pk_jax.Mechanism")
     assert ask(STEWART, np.ones(6), modes).startswith("modes.poses must be a pk_jax.SE3")
-    assert ask(RPR, LENGTHS, modes, nodes=0).startswith("nodes must be an integer >= 1")
-    assert ask(outsiders.delta(), np.zeros(3), modes) == (
-        "connect_modes needs a closed form inverse, and Delta has none"
+    assert ask(RPR, LENGTHS, modes, nodes=0).startswith("nodes must be an integer from 1 to")
+    assert ask(outsiders.implicit_delta(), np.zeros(3), modes) == (
+        "connect_modes needs a closed form inverse, and ImplicitDelta has none"
     )
     short = jax.tree.map(lambda leaf: leaf.astype(np.float32), RPR)
     assert ask(short, LENGTHS, modes) == "connect_modes needs float64: call pk_jax.enable_x64() first"

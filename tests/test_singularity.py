@@ -431,4 +431,4 @@ def test_what_is_refused():
         assert said_by(pk.classify_singularity, *at, tol=tol).startswith("tol must be in (0, 1)")
     for length in (0.0, -1.0, NAN, INF, [1.0, 2.0], "m"):
         assert said_by(pk.classify_singularity, *at, length=length).startswith("length must ")
-    assert said_by(pk.singularity_distance, *at, kind="III") == 'kind must be "I", "II" or "any", got \'III\''
+    assert said_by(pk.singularity_distance, *at, kind="III") == "kind must be one of I, II, any, got 'III'"

@@ -341,7 +341,7 @@ def test_bad_node_counts(nodes):
 
 
 def test_unknown_rule_and_mechanism():
-    with pytest.raises(ValueError, match="rule must be one of 'gauss', 'midpoint', 'paper', got 'simpson'"):
+    with pytest.raises(ValueError, match="rule must be one of gauss, midpoint, paper, got 'simpson'"):
         pk.workspace_indices(two_rpr(1.5), "simpson")
     with pytest.raises(ValueError, match="takes a TwoRPR or a FiveBar, got str"):
         pk.workspace_indices("2-rpr")

@@ -574,19 +574,13 @@ def test_a_lost_row_is_nan_and_hurts_no_other():
 # ---------------------------------------------------------------- at the door
 
 
-class NoForm(pk.TwoRPR):
-    """Margins, but no closed form."""
-
-    inverse = property()
-
-
 def test_bad_maps_are_refused_in_one_line():
     two = pk.TwoRPR(half_base=1.0, l_min=1.0, l_max=3.0)
     no_margins = outsiders.three_rpr()
     ask, box = partial(said_by, pk.workspace_map), ((-0.1, 0.1), (-0.1, 0.1))
     assert ask("5-link") == "workspace_map takes a pk_jax.Mechanism, got str"
     assert ask(no_margins) == "ThreeRPR has no margins: give it limits (strokes, cones, ...)"
-    assert ask(NoForm(half_base=1.0, l_min=1.0, l_max=3.0)).startswith("workspace_map needs the closed form")
+    assert ask(outsiders.implicit_delta()).startswith("workspace_map needs the closed form")
     for axes in (("roll",), ("roll", "roll"), ("x", "y"), ("s", "roll", "pitch", "yaw"), "roll"):
         assert ask(CASING, axes).startswith("axes must be 2 to 3 different ones of s, roll, pitch, yaw, got")
     assert ask(CASING, free="best") == "free must be numbers or \"any\", got 'best'"

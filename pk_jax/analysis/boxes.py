@@ -50,7 +50,7 @@ class Box:
         at = coordinates_of(jax.tree.map(lambda leaf: leaf[None], pose))[0]
         self.home = np.append(at, np.asarray(joints)[len(joints) - mech.free_joints :])
         lower, upper = self.home.copy(), self.home.copy()
-        for name, given in ranges.items():
+        for name, given in checks.is_dict("ranges", ranges).items():
             if name not in self.names:
                 raise ValueError(f"ranges must name some of {', '.join(self.names)}, got {name!r}")
             ends = checks.real_numpy(f"ranges[{name!r}]", given).astype(float)

@@ -83,8 +83,10 @@ def certify_regular(
     if not np.all(np.isfinite(at)):
         raise ValueError(f"no certificate for {type(mech).__name__}: A depends on joints that are not free")
     at_home, at_centre = np.linalg.det(at)
+    if scale is not None and not callable(scale):
+        raise ValueError(f"scale must be a function of the coordinates, got {checks.shown(scale)}")
     scale = abs(at_home) if scale is None else scale
-    within = _margins_named(mech, within) if len(within) else ()
+    within = checks.are_words("within", within) and _margins_named(mech, within)
     settle = partial(_regular, box, scale, within, at_least, np.sign(at_centre))
     return bisected(box, settle, [box.whole], most, report, "no singularity")
 
@@ -115,7 +117,7 @@ def certify_confined(
     """
     _check("certify_confined", mech, at_least)
     names = coordinate_names(mech)
-    if missing := [name for name in names if name not in ranges]:
+    if missing := [name for name in names if name not in checks.is_dict("ranges", ranges)]:
         raise ValueError(f"ranges must have every coordinate of the pose, {', '.join(missing)} missing")
     free = dict(zip(free_names(mech), np.asarray(mech.free_range()), strict=True)) if mech.free_joints else {}
     box = Box(mech, {**ranges, **free})
@@ -141,8 +143,8 @@ def _check(function: str, mech: Any, at_least: Any) -> None:
     require_mechanism(function, mech)
     if not checks.is_concrete(mech) or mech.length().dtype != jnp.float64:
         raise ValueError("a certificate needs known values in float64: call pk_jax.enable_x64() first")
-    if not (np.ndim(at_least) == 0 and np.isfinite(at_least) and at_least >= 0):
-        raise ValueError(f"at_least must be a finite number >= 0, got {at_least}")
+    if not (checks.is_number(at_least) and at_least >= 0):
+        raise ValueError(f"at_least must be a finite number >= 0, got {checks.shown(at_least)}")
 
 
 # --- one box: A is regular
@@ -260,7 +262,7 @@ def _weights(values: np.ndarray, slopes: np.ndarray, half: np.ndarray) -> np.nda
 def _margins_named(mech: Mechanism, within: Sequence[str] | None) -> tuple[str, ...]:
     """Names of margins, by default all; ValueError where the mechanism does not have them."""
     known = tuple(mech.margins(*mech.home()))
-    within = known if within is None else (within,) if isinstance(within, str) else tuple(within)
+    within = known if within is None else checks.are_words("within", within)
     if not within:
         raise ValueError(f"{type(mech).__name__} has no margins: give it limits (strokes, cones, ...)")
     if unknown := [name for name in within if name not in known]:

@@ -13,6 +13,7 @@ from pk_jax.geometry import safe
 from pk_jax.geometry.poses import pose_units
 from pk_jax.kinematics.batching import home_shapes, over_rows, rows_of, where
 from pk_jax.kinematics.inverse import branch_rows, inverse_kinematics
+from pk_jax.kinematics.jacobi import least_singular_value
 from pk_jax.kinematics.jacobian import SINGULAR_BELOW, ScaledJacobians, scaled_jacobians
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
@@ -61,7 +62,7 @@ def _one(mech: Mechanism, pose: jax.Array, branch: jax.Array | None = None) -> L
     joints = jnp.where(is_ok, solved.joints, home_joints)
     isotropy, resistivity = indices_at(mech, pose, joints)
     jacobian = jax.lax.stop_gradient(scaled_jacobians(mech, pose, joints).pose)
-    sigma = jnp.linalg.svd(jacobian, compute_uv=False)[-1]
+    sigma = least_singular_value(jacobian)
     is_type_one = solved.status == Status.SINGULAR
     is_type_two = is_ok & (sigma < SINGULAR_BELOW)
     limit = lambda value, type_one: jnp.where(is_ok, value, jnp.where(is_type_one, type_one, jnp.nan))

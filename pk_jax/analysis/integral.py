@@ -134,7 +134,7 @@ def workspace_integral(
     unit = None
     if plan.rule == "rays":
         n = region.size(given.centre)
-        plan = plan._replace(devices=() if devices is None else tuple(devices))
+        plan = plan._replace(devices=tuple(checks.are_devices("devices", devices)))
         unit = jnp.asarray(
             direction_sets(n, _rays(rays, n), plan.replicates, checks.is_count("seed", seed, least=0)),
             jax.tree.leaves(given.centre)[0].dtype,
@@ -150,7 +150,7 @@ class IntegralGradient(NamedTuple):
     integral: jax.Array  # (n,), or (f, n)
     mean: jax.Array
     error: Errors  # of these
-    status: jax.Array  # () Status: that of the value, or INCOMPLETE: errors too large, derivatives are NaN
+    status: jax.Array  # () Status: that of the value, or INCOMPLETE: errors too large, some derivatives NaN
 
 
 def integral_gradient(mechanism: Any, vector: Any, index: Any = "frobenius_isotropy", **options: Any):
@@ -160,8 +160,8 @@ def integral_gradient(mechanism: Any, vector: Any, index: Any = "frobenius_isotr
     options:    of `workspace_integral`; without a rule panels for two freedoms, else rays
 
     The errors are those of the derivatives, estimated as those of the values are, and apart from them.
-    Derivatives are refused where an error exceeds a tenth of the greatest one. A `clearance` meets limits of
-    reach at cusps, next to which derivatives converge slowly: their errors say so.
+    Those of a quantity are refused (NaN) where an error exceeds a tenth of its greatest one. A `clearance`
+    meets limits of reach at cusps, next to which derivatives converge slowly: their errors say so.
     """
     vector = checks.real_array("vector", vector)
     checks.has_shape("vector", vector, (None,))
@@ -176,9 +176,10 @@ def integral_gradient(mechanism: Any, vector: Any, index: Any = "frobenius_isotr
     is_spread = len(values) > 2  # by sets of rays
     parts = [slopes[:, 0], slopes[:, 1:], mean_slopes]
     best, errors = zip(*(_judged(part, is_spread) for part in parts), strict=True)
-    is_good = jnp.all(jnp.stack([_is_sure(*each) for each in zip(best, errors, strict=True)]))
+    is_sure = [(found.status == Status.OK) & _is_sure(*each) for each in zip(best, errors, strict=True)]
+    best = [jnp.where(sure[..., None], each, jnp.nan) for sure, each in zip(is_sure, best, strict=True)]
+    is_good = jnp.all(jnp.concatenate([jnp.ravel(sure) for sure in is_sure]))
     status = jnp.where(is_good | (found.status != Status.OK), found.status, Status.INCOMPLETE)
-    best = [jnp.where(status == Status.OK, each, jnp.nan) for each in best]
     flat = (lambda x: x[0]) if is_single else (lambda x: x)
     return IntegralGradient(
         found,
@@ -191,10 +192,10 @@ def integral_gradient(mechanism: Any, vector: Any, index: Any = "frobenius_isotr
 
 
 def _is_sure(slopes: jax.Array, errors: jax.Array) -> jax.Array:
-    """Whether derivatives (..., n) are known well enough; they are where all are zero. -> ()"""
+    """Whether derivatives (..., n) are known well enough; they are where all are zero. -> (...)"""
     greatest = jnp.max(jnp.abs(slopes), axis=-1, initial=0)
     tiny = 1e3 * jnp.finfo(slopes.dtype).eps
-    return jnp.all(jnp.max(errors, axis=-1, initial=0) <= DOUBTFUL * greatest + tiny)  # NaN compares False
+    return jnp.max(errors, axis=-1, initial=0) <= DOUBTFUL * greatest + tiny  # NaN compares False
 
 
 class _Options:
@@ -249,9 +250,9 @@ def _given(mech: Mechanism, about: Any, branch: Any, free: Any) -> Given:
 
 def _region(given, axes, within, clearance, margins, length) -> Region:
     if clearance is not None and not checks.is_number(clearance):
-        raise ValueError(f"clearance must be a finite number, got {clearance!r}")
+        raise ValueError(f"clearance must be a finite number, got {checks.shown(clearance)}")
     if margins is not None and not callable(margins):
-        raise ValueError(f"margins must be a function of (mech, pose, joints), got {margins!r}")
+        raise ValueError(f"margins must be a function of (mech, pose, joints), got {checks.shown(margins)}")
     region = Region(_within(given.mech, within), clearance, margins, length_of(length), _axes(given, axes))
     n = region.size(given.centre)
     if n not in (2, 3, 4, 6):
@@ -265,7 +266,7 @@ def _axes(given: Given, axes: Any) -> tuple[int, ...] | None:
     if axes is None:
         return None
     names = coordinate_names(given.mech)
-    axes = tuple(axes.split(",")) if isinstance(axes, str) else tuple(axes)
+    axes = checks.are_words("axes", axes)
     if len(set(axes)) != len(axes) or not set(axes) <= set(names):
         raise ValueError(f"axes must be different ones of {', '.join(names)}, got {axes}")
     found = tuple(sorted(names.index(name) for name in axes))
@@ -277,8 +278,8 @@ def _axes(given: Given, axes: Any) -> tuple[int, ...] | None:
 
 def _plan(given, region, index, rule, nodes, rays, replicates, cells) -> _Plan:
     n, kind = region.size(given.centre), type(given.mech).__name__
-    if rule not in (None, *RULES):
-        raise ValueError(f"rule must be one of {', '.join(RULES)}, got {rule!r}")
+    if rule is not None:
+        checks.is_word("rule", rule, RULES)
     strokes = stroke_rule.count_strokes(given) if region.axes is None else 0
     if rule is None:
         is_box = strokes == n and given.mech.joints_are_distances
@@ -299,6 +300,7 @@ def _plan(given, region, index, rule, nodes, rays, replicates, cells) -> _Plan:
     replicates = checks.is_count("replicates", replicates, least=4, most=16) if rule == "rays" else 2
     if rule == "panels":
         nodes = _rays(rays, n)
+    _must_fit(rule, n, nodes, _rays(rays, n), replicates)
     return _Plan(problem, rule, nodes, replicates, not isinstance(index, tuple | list))
 
 
@@ -308,6 +310,15 @@ def _is_square(given: Given) -> bool:
     mech = given.mech
     rows = jax.eval_shape(lambda mech: mech.residual(*mech.home()), mech).shape[0]
     return (mech.actuated_rows or rows) == size <= MOST_BROKEN
+
+
+def _must_fit(rule: str, n: int, nodes: int, rays: int, replicates: int) -> None:
+    """ValueError where the nodes or rays of a rule do not fit into memory."""
+    if rule == "strokes":
+        checks.fits(f"nodes = {nodes} along each of {n} strokes", 8 * (3 * n + 4) * nodes**n, "take fewer")
+    elif rule == "rays":
+        size = 8 * (4 * n + 3 * replicates + 32) * rays * replicates  # each ray with its intervals
+        checks.fits(f"{replicates} replicates of rays = {rays}", size, "take fewer")
 
 
 def _rays(rays: int | None, n: int) -> int:
@@ -321,12 +332,12 @@ def _within(mech: Mechanism, within: Any) -> tuple[tuple[int, float, float], ...
         return ()
     names = coordinate_names(mech)
     found = []
-    for name, limits in dict(within).items():
+    for name, limits in checks.is_dict("within", within).items():
         if name not in names:
             raise ValueError(f"within must name coordinates, of {', '.join(names)}, got {name!r}")
         ends = checks.real_numpy(f"within[{name!r}]", limits)
         if ends.shape != (2,) or not ends[0] < ends[1] or not np.all(np.isfinite(ends)):
-            raise ValueError(f"within[{name!r}] must be (least, greatest), got {limits!r}")
+            raise ValueError(f"within[{name!r}] must be (least, greatest), got {checks.shown(limits)}")
         found.append((names.index(name), float(ends[0]), float(ends[1])))
     return tuple(found)
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from pk_jax import checks
 from pk_jax.analysis.continuation import EXACT, Follower, Piece, Report
-from pk_jax.analysis.singularity import SingularityKind, classify_singularity
+from pk_jax.analysis.singularity import SingularityKind, classify_singularity, length_or_own
 from pk_jax.analysis.slices import BLOCK, joints_of, poses_on, slice_of
 from pk_jax.kinematics.batching import home_shapes
 from pk_jax.kinematics.inverse import branch_rows, free_rows, working_modes
@@ -97,21 +97,22 @@ def singularity_locus(
         raise ValueError(
             "singularity_locus needs float64: call pk_jax.enable_x64() before making the mechanism"
         )
-    kinds = tuple(kinds) if not isinstance(kinds, str) else (kinds,)
+    kinds = checks.are_words("kinds", kinds)
     if not kinds or set(kinds) - {"I", "II"}:
         raise ValueError(f'kinds must be of "I", "II", got {kinds}')
     if free is not None:
         free, many = free_rows(mech, free)
         if many:
             raise ValueError("free must be one value of each joint, got a batch")
-    axes = tuple(axes.split(",")) if isinstance(axes, str) else axes
-    kinds = _curves_of(mech, 2 if axes is None else len(axes), kinds)
+    kinds = _curves_of(mech, 2 if axes is None else len(checks.are_words("axes", axes)), kinds)
     where = slice_of(mech, axes, at, ranges)
     nodes = checks.is_count("nodes", NODES[len(where.axes)] if nodes is None else nodes, least=3, most=2001)
-    length = mech.length() if length is None else checks.real_array("length", length)
+    length = length_or_own(mech, length)
     modes = working_modes(mech)
     if branch is not None:
         modes = np.asarray(branch_rows(mech, branch)[0]).reshape(1, -1)
+    numbers = 30 + len(modes) * (4 + home_shapes(mech)[1].shape[0])  # a node: poses, and of each mode joints
+    checks.fits(f"nodes = {nodes}", 8 * numbers * nodes ** len(where.axes), "take fewer")
     say = report or (lambda *_: None)
 
     lines, poses = where.grid(nodes)

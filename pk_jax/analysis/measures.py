@@ -21,8 +21,9 @@ from pk_jax.geometry import safe
 from pk_jax.geometry.matrices import small_det, small_inverse
 from pk_jax.geometry.poses import pose_units
 from pk_jax.kinematics.blocks import has_one_joint_an_equation, joint_blocks
-from pk_jax.kinematics.jacobian import joint_jacobian, pose_jacobian, units
+from pk_jax.kinematics.jacobian import joint_jacobian, pose_jacobian
 from pk_jax.mechanisms.base import Mechanism
+from pk_jax.mechanisms.regular import units
 
 Measure = Callable[[Mechanism, Any, jax.Array], jax.Array]  # of one configuration -> ()
 
@@ -136,7 +137,9 @@ def measure_of(index: Any, length: float | None = None) -> Measure:
     if callable(index):
         return index
     if not isinstance(index, str) or index not in INDICES:
-        raise ValueError(f"index must be a function or one of {', '.join(INDICES)}, got {index!r}")
+        raise ValueError(
+            f"index must be a function or one of {', '.join(INDICES)}, got {checks.shown(index)}"
+        )
     return INDICES[index] if length is None else partial(INDICES[index], length=length)
 
 
@@ -151,5 +154,5 @@ def names_of(indices: Any) -> tuple[Any, ...]:
 def length_of(value: Any) -> float | None:
     """A length that was given, positive and finite, or None."""
     if value is not None and not (checks.is_number(value) and value > 0):
-        raise ValueError(f"length must be a positive number, got {value!r}")
+        raise ValueError(f"length must be a positive number, got {checks.shown(value)}")
     return None if value is None else float(np.float64(value))

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from pk_jax import checks
 from pk_jax.kinematics import newton
 from pk_jax.kinematics.batching import home_shapes, over_rows, rows_of
 from pk_jax.kinematics.inverse import branch_rows, inverse_kinematics
@@ -48,8 +49,7 @@ def resolve_redundancy(mech: Mechanism, pose: Any, by: str = "margin", branch: A
     ValueError for a mechanism without exactly one such joint, or without margins for `by="margin"`.
     """
     require_mechanism("resolve_redundancy", mech)
-    if by not in WAYS:
-        raise ValueError(f"by must be one of {', '.join(WAYS)}, got {by!r}")
+    checks.is_word("by", by, WAYS)
     if mech.free_joints != 1:
         raise ValueError(
             f"resolve_redundancy takes mechanisms with one redundant joint, {type(mech).__name__} has "

@@ -25,10 +25,11 @@ from pk_jax.kinematics.batching import all_finite, configurations, is_possible, 
 from pk_jax.kinematics.closure import INCONSISTENT_ABOVE, joint_scale, pose_scale
 from pk_jax.kinematics.entrywise import entrywise
 from pk_jax.kinematics.jacobi import lengths, orthogonal_rows
-from pk_jax.kinematics.jacobian import SINGULAR_BELOW, joint_jacobian, pose_jacobian, units
+from pk_jax.kinematics.jacobian import SINGULAR_BELOW, joint_jacobian, pose_jacobian
 from pk_jax.kinematics.lane_map import lane_map
 from pk_jax.kinematics.lanes import Entries, Lane, items_of
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
+from pk_jax.mechanisms.regular import units
 from pk_jax.status import Status
 
 
@@ -77,7 +78,7 @@ def classify_singularity(
     checks.has_shape("tol", checks.real_array("tol", tol), ())
     if checks.is_concrete(tol) and not 0 < float(tol) < 1:
         raise ValueError(f"tol must be in (0, 1), got {tol}")
-    size = _length(mech, length)
+    size = length_or_own(mech, length)
     known = checks.is_concrete((mech, rows, size, tol)) and not checks.is_staged()
     if known and any(are_batched):
         return _known(mech, rows, are_batched, size, tol)
@@ -93,16 +94,15 @@ def singularity_distance(
     objective. At a singularity the derivative is that of one side; where two distances are equally small
     it is that of one of them. Conventions of `classify_singularity`; NaN where the loops are open.
     """
-    if kind not in ("I", "II", "any"):
-        raise ValueError(f'kind must be "I", "II" or "any", got {kind!r}')
+    checks.is_word("kind", kind, ("I", "II", "any"))
     require_mechanism("singularity_distance", mech)
     rows, are_batched = configurations(mech, pose, joints)
-    found = _traced(mech, rows, _length(mech, length), SINGULAR_BELOW, are_batched)
+    found = _traced(mech, rows, length_or_own(mech, length), SINGULAR_BELOW, are_batched)
     inverse, direct = found.sigma_inverse, found.sigma_direct
     return {"I": inverse, "II": direct, "any": jnp.minimum(inverse, direct)}[kind]
 
 
-def _length(mech: Mechanism, length: Any) -> jax.Array:
+def length_or_own(mech: Mechanism, length: Any) -> jax.Array:
     if length is None:
         return mech.length()
     length = checks.real_array("length", length)

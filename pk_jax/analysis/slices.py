@@ -120,10 +120,15 @@ def slice_of(
     at:      pose that has the other coordinates; default: home
     ranges:  ((lower, upper), ...) of the axes; default: what the mechanism reaches
     """
-    names = coordinate_names(mech)
+    names, joints = coordinate_names(mech), home_shapes(mech)[1].shape[0]
+    if joints - mech.free_joints < len(names):
+        raise ValueError(
+            f"{type(mech).__name__} has {joints} joints for {len(names)} coordinates of its pose: a platform "
+            "that is constrained fills no slice of them"
+        )
     if axes is None:
         axes = names[:2]
-    axes = tuple(axes.split(",")) if isinstance(axes, str) else tuple(axes)
+    axes = checks.are_words("axes", axes)
     if not (2 <= len(axes) <= most and len(set(axes)) == len(axes) and set(axes) <= set(names)):
         raise ValueError(f"axes must be 2 to {most} different ones of {', '.join(names)}, got {axes}")
     home_pose = home_shapes(mech)[0]

@@ -71,8 +71,7 @@ def workspace_indices(
     la = R; a design space offers the variable v, la = R (1 + v^2), in which it is not.
     `jax.vmap` over designs runs in chunks of bounded memory.
     """
-    if rule not in _RULES:
-        raise ValueError(f"rule must be one of {', '.join(map(repr, _RULES))}, got {rule!r}")
+    checks.is_word("rule", rule, _RULES)
     if not isinstance(mech, TwoRPR | FiveBar):
         raise ValueError(f"workspace_indices takes a TwoRPR or a FiveBar, got {type(mech).__name__}")
     if mech.half_base.ndim:
@@ -80,7 +79,7 @@ def workspace_indices(
     if nodes is None:
         nodes = {"midpoint": (200, 300), "paper": (50, 100)}.get(rule, _GAUSS_NODES[type(mech)])
     if not isinstance(nodes, tuple | list) or len(nodes) != 2:
-        raise ValueError(f"nodes must be two integers (outer, inner), got {nodes!r}")
+        raise ValueError(f"nodes must be two integers (outer, inner), got {checks.shown(nodes)}")
     least = 4 if rule == "paper" else 2
     nodes = tuple(checks.is_count("nodes", count, least=least, most=MOST_NODES[rule]) for count in nodes)
     if rule == "midpoint" and mech.half_base.dtype != jnp.float64:

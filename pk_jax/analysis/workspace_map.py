@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -23,6 +24,7 @@ from pk_jax.kinematics.lanes import Entries
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 
 NODES = {2: 201, 3: 41}
+MOST_NODES = 100_001  # along one axis
 ANY = "any"
 
 
@@ -71,8 +73,13 @@ def workspace_map(
     d = len(where.axes)
     counts = (NODES[d],) * d if nodes is None else nodes if isinstance(nodes, Sequence) else (nodes,) * d
     if isinstance(counts, str) or len(counts) != d:
-        raise ValueError(f"nodes must be one number, or one for each of the {d} axes, got {nodes!r}")
-    counts = [checks.is_count("nodes", count, least=2, most=100_001) for count in counts]
+        raise ValueError(
+            f"nodes must be one number, or one for each of the {d} axes, got {checks.shown(nodes)}"
+        )
+    counts = [checks.is_count("nodes", count, least=2, most=MOST_NODES) for count in counts]
+    checks.fits(
+        f"nodes = {nodes}", 8 * (3 * d + 6) * math.prod(counts), "take fewer, or a part of the ranges"
+    )
     lines = [np.linspace(*ends) for ends in zip(where.lower, where.upper, counts, strict=True)]
     values = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, d)
     margin, limit = limits.over(where, values)
@@ -118,14 +125,13 @@ def travel(
     """
     limits = _Limits("travel", mech, branch, free)
     names = coordinate_names(mech)
-    if coordinate not in names:
-        raise ValueError(f"coordinate must be one of {', '.join(names)}, got {coordinate!r}")
+    checks.is_word("coordinate", coordinate, names)
     axis = names.index(coordinate)
     pose = home_shapes(mech)[0]
     unit = pose_units(pose, mech.pose_units)[axis]
-    most = float(most) if most is not None else 4 * float(mech.length()) if unit else np.pi
-    if not (np.isfinite(most) and most > 0):
-        raise ValueError(f"most must be positive and finite, got {most}")
+    most = most if most is not None else 4 * float(mech.length()) if unit else np.pi
+    if not (checks.is_number(most) and most > 0):
+        raise ValueError(f"most must be positive and finite, got {checks.shown(most)}")
     steps = checks.is_count("steps", steps, most=100_000)
     at, many = rows_of("at", mech.home()[0] if at is None else at, pose)
     starts = jax.tree.map(lambda leaf: leaf if many else leaf[None], at)

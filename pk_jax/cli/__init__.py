@@ -24,7 +24,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parsed(sys.argv[1:] if arguments is None else arguments)
     try:
         with _plain_warnings(), _stopped_by_signals():
-            return options.run(options)
+            code = options.run(options)
+            sys.stdout.flush()
+            return code
     except ValueError as error:
         return _fail(BAD_INPUT, str(error))
     except BrokenPipeError:  # the reader of our output has gone, e.g. `| head`
@@ -36,8 +38,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(FILE_SYSTEM, f"{error.strerror or error}{where}")
     except FloatingPointError as error:
         return _fail(NUMERICAL, str(error))
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
+            return _fault(error)
+        return _fail(BAD_INPUT, f"not enough memory, ask for less: {str(error)[:200]}")
     except KeyboardInterrupt:
         return _fail(INTERRUPTED, "interrupted")
+    except Exception as error:
+        return _fault(error)
+
+
+def _fault(error: Exception) -> int:
+    """An error of a user's Python file is told in a line; one of ours is raised."""
+    if (read := sys.modules.get("pk_jax.files.python_file")) and (said := read.fault_in(error)):
+        return _fail(BAD_INPUT, said)
+    raise error
 
 
 def _fail(code: int, message: str) -> int:

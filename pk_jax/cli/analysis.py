@@ -70,13 +70,13 @@ def _singularity(options: argparse.Namespace) -> int:
             options.free,
         )
         progress.close()
-        print(singular.locus_text(named, locus))
         if table:
             table.write(singular.locus_rows(named, locus).encode())
         if image:
             unit = named.unit if (named.path or options.unit) and named.unit != "1" else ""
             figure = viz.draw_locus(named.mechanism, locus, unit=unit, scale=named.metres)
             figure.savefig(image, format=kind, dpi=150)
+        print(singular.locus_text(named, locus))
     return 0
 
 
@@ -110,7 +110,6 @@ def _map(options: argparse.Namespace) -> int:
         found, travels = limits.map_of(
             named, options.axes, at, options.range, options.mode, options.free, options.nodes
         )
-        print(limits.map_text(named, found, travels))
         if table:
             table.write(limits.map_rows(named, found).encode())
         if image:
@@ -118,6 +117,7 @@ def _map(options: argparse.Namespace) -> int:
             axes = draw_map(found, unit=unit, scale=named.metres)
             axes.set_title(Path(named.name).name)
             axes.figure.savefig(image, format=kind, dpi=150)
+        print(limits.map_text(named, found, travels))
     return 0
 
 

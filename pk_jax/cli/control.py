@@ -69,12 +69,12 @@ def _simulate(options: argparse.Namespace) -> int:
         table = stack.enter_context(output_file(options.csv)) if options.csv else None
         runs = simulated.runs_of(one, feedbacks, options.seeds, options.seed, progress.say)
         progress.close()
-        print(as_json(simulated.table_of(one, runs)) if options.json else simulated.table_text(one, runs))
         if table:
             table.write(simulated.samples_csv(one, runs).encode())
         if image:
             axes = draw_tracking(runs, scale=named.metres, unit="" if named.unit == "1" else named.unit)
             axes.set_title(f"{Path(named.name).name}: {one.reference.name}")
             axes.figure.savefig(image, format=kind, dpi=150)
+        print(as_json(simulated.table_of(one, runs)) if options.json else simulated.table_text(one, runs))
     is_ok = not any(row["not_ok"] for row in simulated.table_of(one, runs)["feedback"].values())
     return 0 if is_ok else NUMERICAL

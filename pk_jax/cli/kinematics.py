@@ -10,6 +10,8 @@ import time
 from pk_jax.cli import NOT_OK, begin
 from pk_jax.cli.options import FREE, MECHANISM, UNIT, Command, image_kind, takes_mechanism, takes_pose
 
+MOST_ROWS = 10_000_000  # at a time
+
 
 def add_forward(command: Command) -> None:
     sub = command("fk", _forward, "forward kinematics of rows of joints (CSV in, CSV out)")
@@ -67,6 +69,8 @@ def _convert(options: argparse.Namespace, function: str, **more: str | bool | No
 
     if options.chunk < 1:
         raise ValueError(f"--chunk must be at least 1, got {options.chunk}")
+    if options.chunk > MOST_ROWS:
+        raise ValueError(f"--chunk must be at most {MOST_ROWS}, got {options.chunk}")
     begun = time.monotonic()
     named = named_mechanism(options.mechanism, options.unit)
     to_terminal = options.out in (None, "-") and sys.stdout.isatty()  # rows and progress would mix
@@ -146,11 +150,11 @@ def _modes(options: argparse.Namespace) -> int:
         image = stack.enter_context(output_file(options.figure)) if options.figure else None
         one = assembled.assembled(named, joints, connect=options.connect, report=progress)
         progress.close()
-        print(assembled.modes_text(one))
         if table:
             table.write(assembled.modes_csv(one).encode())
         if image:
             from pk_jax.viz.assembly import draw_modes
 
             draw_modes(named.mechanism, joints[0], one.modes[0]).savefig(image, format=kind, dpi=200)
+        print(assembled.modes_text(one))
     return NOT_OK if options.strict and not all(each.is_complete for each in one.modes) else 0

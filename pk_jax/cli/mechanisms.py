@@ -1,4 +1,4 @@
-"""What a mechanism is: show, draw, list."""
+"""What a mechanism is: show, check, draw, list."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from pk_jax.cli import begin
-from pk_jax.cli.options import Command, image_kind, takes_mechanism, takes_pose
+from pk_jax.cli.options import MECHANISM, Command, image_kind, takes_mechanism, takes_pose
 
 
 def add_show(command: Command) -> None:
@@ -19,6 +19,32 @@ def _show(options: argparse.Namespace) -> int:
     from pk_jax.files.shown import describe
 
     print(describe(named_mechanism(options.mechanism, options.unit)))
+    return 0
+
+
+def add_check(command: Command) -> None:
+    sub = command(
+        "check", _check, "whether a mechanism keeps the laws of kinematics, or a design run can be run"
+    )
+    takes_mechanism(sub, f"{MECHANISM}, or a RUN.toml of optimize")
+
+
+def _check(options: argparse.Namespace) -> int:
+    progress = begin()
+    from pk_jax.files import checked
+    from pk_jax.files.named import named_mechanism
+    from pk_jax.files.run_file import is_run_file, read_run
+
+    if is_run_file(options.mechanism):
+        if options.unit is not None:
+            raise ValueError("--unit is for a mechanism, a run file says its own")
+        text = checked.run_text(options.mechanism, read_run(options.mechanism))
+    else:
+        named = named_mechanism(options.mechanism, options.unit)
+        progress.say("checking the laws")
+        text = checked.mechanism_text(named)
+    progress.close()
+    print(text)
     return 0
 
 

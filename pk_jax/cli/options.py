@@ -8,8 +8,8 @@ from pathlib import Path
 
 Command = Callable[..., argparse.ArgumentParser]  # (name, run, text) -> its parser
 
-MECHANISM = "a catalogue entry (see: pk-jax list) or a TOML file"
-UNIT = "of lengths: m, mm, cm, in or um (default: the file's own, m for a catalogue entry)"
+MECHANISM = "a catalogue entry (see: pk-jax list), a TOML file, or FILE.py:NAME, which runs that file"
+UNIT = "of lengths: m, mm, cm, in or um (default: that of the TOML file, otherwise m)"
 FREE = "redundant joint, or margin, conditioning or middle: what to choose it by (default: as at home)"
 
 

@@ -21,6 +21,7 @@ _VERBS = (  # in the order of --help
     kinematics.add_jacobian,
     mechanisms.add_draw,
     mechanisms.add_show,
+    mechanisms.add_check,
     analysis.add_singularity,
     analysis.add_map,
     analysis.add_certify,
@@ -45,6 +46,9 @@ def parsed(arguments: Sequence[str]) -> argparse.Namespace:
 
     for add in _VERBS:
         add(command)
+    for argument in arguments:
+        if not argument or "\0" in argument:  # an empty variable of a script; what no file can be called
+            parser.error(f"an argument must not be empty or hold a null character, got {argument!r}")
     return parser.parse_args(_with_values_joined(arguments))
 
 

@@ -96,8 +96,7 @@ def simulate_control(
     STALLED where its loops would not close, NONFINITE where an estimate was lost. float64 only.
     """
     require_nine_rows("simulate_control", stewart)
-    if feedback not in FEEDBACKS:
-        raise ValueError(f"feedback must be one of {', '.join(FEEDBACKS)}, got {feedback!r}")
+    checks.is_word("feedback", feedback, FEEDBACKS)
     if not isinstance(reference, Reference):
         raise ValueError(
             f"reference must come from circle_reference or step_reference, got {type(reference).__name__}"
@@ -117,9 +116,11 @@ def simulate_control(
     checks.has_shape("weights", weights, (ROWS,))
     checks.is_positive("weights", weights)
     checks.is_finite("weights", weights)
-    samples = round(reference.duration / plant.period)
+    samples = round(min(reference.duration / plant.period, 1e18))
     if not 2 <= samples <= 10_000_000:
         raise ValueError(f"duration over period must be from 2 to 10,000,000 samples, got {samples}")
+    numbers = 3 * samples * (42 * seeds + 30)  # a seed has two poses, legs, commands and errors a sample
+    checks.fits(f"{samples} samples of {seeds} seeds", 8 * numbers, "take fewer, or a longer period")
     late = plant.delay * plant.period + plant.lag
     if not (late < reference.duration and reference.settled_after < (samples - 1) * plant.period):
         raise ValueError(

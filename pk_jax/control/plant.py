@@ -30,6 +30,7 @@ class Plant(NamedTuple):
 
 
 IDEAL = Plant(noise=0.0, quantum=0.0)
+GREATEST = 1e100  # its square is a number
 TINIEST = 1e-9  # standard deviation of the reading of a perfect encoder
 
 
@@ -48,7 +49,9 @@ def check_plant(plant: Plant) -> None:
         raise ValueError(f"plant must be a pk_jax.Plant, got {type(plant).__name__}")
     for name, value in plant._asdict().items():
         if not (checks.is_number(value) and value >= 0):
-            raise ValueError(f"plant.{name} must be a finite number >= 0, got {value!r}")
+            raise ValueError(f"plant.{name} must be a finite number >= 0, got {checks.shown(value)}")
+        if value > GREATEST:
+            raise ValueError(f"plant.{name} must be at most {GREATEST:g}, got {checks.shown(value)}")
     for name in ("period", "rate_limit"):
         if not getattr(plant, name) > 0:
             raise ValueError(f"plant.{name} must be positive, got {getattr(plant, name)}")
@@ -60,10 +63,10 @@ def check_gains(gains: Gains) -> None:
     if not isinstance(gains, Gains):
         raise ValueError(f"gains must be a pk_jax.Gains, got {type(gains).__name__}")
     if not isinstance(gains.anti_windup, bool | np.bool_ | int | float):
-        raise ValueError(f"gains.anti_windup must be true or false, got {gains.anti_windup!r}")
+        raise ValueError(f"gains.anti_windup must be true or false, got {checks.shown(gains.anti_windup)}")
     for name in ("kp", "ki", "kd", "feed_forward"):
         if not checks.is_number(value := getattr(gains, name)):
-            raise ValueError(f"gains.{name} must be finite, got {value!r}")
+            raise ValueError(f"gains.{name} must be finite, got {checks.shown(value)}")
 
 
 def checked_key(key: Any) -> jax.Array:

@@ -13,7 +13,7 @@ from pk_jax import checks
 from pk_jax.geometry import rotations
 from pk_jax.geometry.poses import retract
 from pk_jax.geometry.se3 import SE3
-from pk_jax.mechanisms.base import Mechanism
+from pk_jax.mechanisms.base import Mechanism, require_mechanism
 
 
 class Reference(NamedTuple):
@@ -49,7 +49,7 @@ def circle_reference(
     for name, value in (("radius", radius), ("frequency", frequency), ("ramp", ramp), ("duration", duration)):
         _is_positive(name, value)
     if not checks.is_number(tilt):
-        raise ValueError(f"tilt must be finite, got {tilt}")
+        raise ValueError(f"tilt must be finite, got {checks.shown(tilt)}")
     if not duration > ramp:
         raise ValueError(f"duration must be more than the ramp, {ramp} s, got {duration}")
 
@@ -79,6 +79,7 @@ def step_reference(mech: Mechanism, twist: Any, *, centre: Any = None, duration:
 
 
 def _home_of(mech: Mechanism, centre: Any) -> SE3:
+    require_mechanism("a reference", mech)
     home = mech.home()[0]
     if not isinstance(home, SE3):
         raise ValueError(f"a reference is for platforms in space, got {type(mech).__name__}")
@@ -94,4 +95,4 @@ def _home_of(mech: Mechanism, centre: Any) -> SE3:
 
 def _is_positive(name: str, value: Any) -> None:
     if not (checks.is_number(value) and value > 0):
-        raise ValueError(f"{name} must be positive and finite, got {value}")
+        raise ValueError(f"{name} must be positive and finite, got {checks.shown(value)}")

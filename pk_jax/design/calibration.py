@@ -293,7 +293,7 @@ def _known(mech: Mechanism) -> list[str]:
 
 def _named(mech: Mechanism, fields: Any, offsets: bool) -> tuple[str, ...]:
     name, known = type(mech).__name__, _known(mech)
-    fields = (fields,) if isinstance(fields, str) else tuple(fields)
+    fields = checks.are_words("fields", fields)
     for field in fields:
         if field not in known:
             raise ValueError(f"fields must be among {', '.join(known)} of this {name}, got {field!r}")

@@ -46,11 +46,12 @@ def evaluate_designs(
         raise ValueError(f"problem must be a DesignProblem, got {type(problem).__name__}")
     vectors = checks.real_numpy("vectors", vectors).astype(jnp.zeros(()).dtype)
     checks.has_shape("vectors", vectors, (None, len(problem.entries)))
-    devices = jax.local_devices()[:1] if devices is None else list(devices)
+    devices, slopes = checks.are_devices("devices", devices), bool(slopes)
     if not len(vectors):
         raise ValueError("vectors must hold at least one design")
-    if not devices:
-        raise ValueError("devices must hold at least one")
+    answers = problem.objective_count + len(problem.constraint_names)
+    size = 8 * 2 * answers * (1 + len(problem.entries) if slopes else 1) * len(vectors)
+    checks.fits(f"answers for {len(vectors)} vectors", size, "take fewer at a time")
     is_given = np.isfinite(vectors).all(axis=1)
     middle = (problem.lower + problem.upper) / 2
     filled = np.concatenate([vectors, np.tile(middle, (-len(vectors) % BLOCK, 1))])

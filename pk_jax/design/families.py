@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from pk_jax import checks
 from pk_jax.mechanisms.base import Mechanism
 from pk_jax.mechanisms.casing_oscillator import CasingOscillator
 from pk_jax.mechanisms.five_bar import FiveBar
@@ -148,6 +149,4 @@ def design_family(name: str) -> Family:
     casing-oscillator  base_radius, platform_radius, slide and carriage of the neutral configuration,
                        half_stroke about it, half-angles of the cones, rad; defaults in metres
     """
-    if name not in _FAMILIES:
-        raise ValueError(f"design family must be one of {', '.join(map(repr, _FAMILIES))}, got {name!r}")
-    return _FAMILIES[name]
+    return _FAMILIES[checks.is_word("design family", name, _FAMILIES)]

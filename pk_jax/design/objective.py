@@ -53,7 +53,7 @@ def require_weights(weights: Any) -> jax.Array:
 def require_bounds(bounds: Any) -> IndexBounds:
     """`bounds` as arrays; ValueError unless lower < upper for each index."""
     if not isinstance(bounds, tuple | list) or len(bounds) != 2:
-        raise ValueError(f"bounds must be (lower, upper), three numbers each, got {bounds!r}")
+        raise ValueError(f"bounds must be (lower, upper), three numbers each, got {checks.shown(bounds)}")
     found = IndexBounds(*(checks.real_array("bounds", bound) for bound in bounds))
     for bound in found:
         checks.has_shape("bounds", bound, (3,))

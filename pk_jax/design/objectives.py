@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -31,10 +32,11 @@ def rectangle(lower: Any, upper: Any, nodes: Any) -> jax.Array:
     checks.is_finite("upper", upper)
     if not np.all(lower <= upper):
         raise ValueError(f"lower must be at most upper, got {lower.tolist()} and {upper.tolist()}")
-    counts = list(nodes) if isinstance(nodes, list | tuple | np.ndarray) else [nodes] * len(lower)
+    counts = nodes if isinstance(nodes, list | tuple | np.ndarray) else [nodes] * len(lower)
     if len(counts) != len(lower):
-        raise ValueError(f"nodes must be one number, or {len(lower)} of them, got {nodes!r}")
-    counts = [checks.is_count("nodes", int(c) if isinstance(c, np.integer) else c) for c in counts]
+        raise ValueError(f"nodes must be one number, or {len(lower)} of them, got {checks.shown(nodes)}")
+    counts = [checks.is_count("nodes", count, most=10**9) for count in counts]
+    checks.fits(f"nodes = {nodes}", 8 * (3 * len(counts) + 3) * math.prod(counts), "take fewer")
     lines = [np.linspace(*ends) for ends in zip(lower, upper, counts, strict=True)]
     return jnp.asarray(np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lower)))
 
@@ -53,6 +55,7 @@ def least_over(
     poses = _batch(poses)
 
     def objective(mech: Mechanism) -> jax.Array:
+        _require_inverse("least_over", mech)
         home, at_home = jax.lax.stop_gradient(mech.home())
 
         def one(pose):
@@ -70,7 +73,12 @@ def least_over(
 def margins_over(poses: Any, branch: Any = None) -> Callable[[Mechanism], dict[str, jax.Array]]:
     """The mechanism's margins at every one of `poses`, as constraints: name -> (k, ...)."""
     poses = _batch(poses)
-    return lambda mech: jax.vmap(lambda pose: mech.margins(pose, mech.inverse(pose, branch)))(poses)
+
+    def margins(mech: Mechanism) -> dict[str, jax.Array]:
+        _require_inverse("margins_over", mech)
+        return jax.vmap(lambda pose: mech.margins(pose, mech.inverse(pose, branch)))(poses)
+
+    return margins
 
 
 def over_workspace(
@@ -82,11 +90,15 @@ def over_workspace(
     are known. NaN where the integral is not to be trusted: an optimizer steps back.
     -> function Mechanism -> ()
     """
-    if measure not in MEASURES:
-        raise ValueError(f"measure must be one of {', '.join(MEASURES)}, got {measure!r}")
+    checks.is_word("measure", measure, MEASURES)
     measure_of(index)
     asked = () if measure == "volume" else index
     return lambda mech: getattr(workspace_integral(mech, asked, **options), measure)
+
+
+def _require_inverse(function: str, mech: Mechanism) -> None:
+    if not hasattr(mech, "inverse"):
+        raise ValueError(f"{function} needs the closed form `inverse`, {type(mech).__name__} has none")
 
 
 def _batch(poses: Any) -> Any:

@@ -168,6 +168,8 @@ def maximize(
     """Maximize slopes[i] @ (gii, gri, sui) for every row of slopes (k, 3), all in one batch."""
     slopes, boxes = np.asarray(slopes), _start_boxes(space, starts)
     count = len(boxes)
+    size = 8 * (4 * boxes.shape[1] + 6) * steps * count * len(slopes)  # every step is kept
+    checks.fits(f"{steps} steps of {count * len(slopes)} starts", size, "take fewer")
     trail = _climb(
         space, np.repeat(slopes, count, axis=0), np.tile(boxes, (len(slopes), 1)), steps, tolerance, report
     )
@@ -287,5 +289,5 @@ def _tolerance(tolerance: float | None) -> float:
     if tolerance is None:
         return 1e-7 if jnp.zeros(()).dtype == jnp.float64 else 1e-3
     if not (isinstance(tolerance, float | int) and 0 < tolerance < 1):
-        raise ValueError(f"tolerance must be a number between 0 and 1, got {tolerance!r}")
+        raise ValueError(f"tolerance must be a number between 0 and 1, got {checks.shown(tolerance)}")
     return float(tolerance)

@@ -12,7 +12,7 @@ import numpy as np
 from pk_jax import checks
 from pk_jax.design.optimize import Report, index_bounds, indices_and_slopes, maximize
 from pk_jax.design.problem import DesignProblem
-from pk_jax.design.search import Search, advance, begin, start_boxes
+from pk_jax.design.search import Search, advance, begin, must_fit, start_boxes
 from pk_jax.design.variables import DesignSpace
 from pk_jax.geometry.spread import evenly
 from pk_jax.status import Status
@@ -123,8 +123,9 @@ def pareto_problem(
         if not len(weights):
             raise ValueError("weights must be positive where a reference is given")
     starts = start_boxes(problem, starts)
-    each = np.repeat(weights / weights.max(axis=1, keepdims=True), len(starts), axis=0)
     weighted = _Weighted(problem, reference)
+    must_fit(weighted, len(weights) * len(starts))
+    each = np.repeat(weights / weights.max(axis=1, keepdims=True), len(starts), axis=0)
     search = begin(
         weighted, np.concatenate([np.tile(starts, (len(weights), 1)), each], axis=1), tolerance=tolerance
     )

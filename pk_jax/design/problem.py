@@ -45,7 +45,7 @@ class DesignProblem:
         if constraints is not None and not callable(constraints):
             raise ValueError(f"constraints must be a function or None, got {type(constraints).__name__}")
         if not isinstance(name, str):
-            raise ValueError(f"name must be a string, got {name!r}")
+            raise ValueError(f"name must be a string, got {checks.shown(name)}")
         self.name = name
         self._mechanism, self._objective, self._constraints = mechanism, objective, constraints
         bounds = _bounds(variables)
@@ -123,14 +123,14 @@ class DesignProblem:
 def _bounds(variables: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Lower and upper bounds by name; ValueError unless lower < upper, finite and of one shape."""
     if not isinstance(variables, Mapping) or not variables:
-        raise ValueError(f"variables must be a dict, name -> (lower, upper), got {variables!r}")
+        raise ValueError(f"variables must be a dict, name -> (lower, upper), got {checks.shown(variables)}")
     found = {}
     for name, pair in variables.items():
         if not isinstance(name, str) or not name:
-            raise ValueError(f"variables must be named by strings, got {name!r}")
+            raise ValueError(f"variables must be named by strings, got {checks.shown(name)}")
         field = f"variables[{name!r}]"
         if not isinstance(pair, tuple | list | np.ndarray) or len(pair) != 2:
-            raise ValueError(f"{field} must be (lower, upper), got {pair!r}")
+            raise ValueError(f"{field} must be (lower, upper), got {checks.shown(pair)}")
         lower, upper = (checks.real_numpy(field, bound).astype(float) for bound in pair)
         if lower.shape != upper.shape or lower.size == 0:
             raise ValueError(

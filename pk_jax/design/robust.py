@@ -41,14 +41,15 @@ def robust(
     """
     if not isinstance(problem, DesignProblem):
         raise ValueError(f"problem must be a DesignProblem, got {type(problem).__name__}")
-    if measure not in MEASURES:
-        raise ValueError(f"measure must be one of {', '.join(map(repr, MEASURES))}, got {measure!r}")
+    checks.is_word("measure", measure, MEASURES)
     if not (checks.is_number(deviations) and deviations >= 0) or (measure == "worst" and deviations):
-        raise ValueError(f"deviations must be a number >= 0, of 'mean' only, got {deviations!r}")
+        raise ValueError(f"deviations must be a number >= 0, of 'mean' only, got {checks.shown(deviations)}")
     samples = checks.is_count("samples", samples, least=2, most=10_000)
     if samples % 2:
         raise ValueError(f"samples must be even, got {samples}")
     seed = checks.is_count("seed", seed, least=0, most=2**32 - 1)
+    size = 100 * samples * (problem.objective_count + len(problem.constraint_names))  # with their names
+    checks.fits(f"samples = {samples} of {problem.name}", size, "take fewer")
     spread = _deviations_of(problem, tolerances)
     errors = np.zeros((samples, len(spread)))
     errors[:, spread > 0] = normal_pairs(samples, np.count_nonzero(spread), seed) * spread[spread > 0]
@@ -79,7 +80,7 @@ def _deviations_of(problem: DesignProblem, tolerances: Any) -> np.ndarray:
     unknown = [name for name in tolerances if name not in problem.shapes]
     if unknown:
         names = ", ".join(problem.shapes)
-        raise ValueError(f"tolerances must be of the variables {names}, got {unknown[0]!r}")
+        raise ValueError(f"tolerances must be of the variables {names}, got {checks.shown(unknown[0])}")
     parts = []
     for name, shape in problem.shapes.items():
         field = f"tolerances[{name!r}]"

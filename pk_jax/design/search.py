@@ -12,6 +12,7 @@ where a run was interrupted. `optimize_problem` is that loop.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -43,6 +44,7 @@ def begin(problem: DesignProblem, boxes: Any, *, tolerance: float | None = None)
     checks.has_shape("boxes", boxes, (None, len(problem.entries)))
     if len(boxes) == 0 or not np.all((boxes >= 0) & (boxes <= 1)):
         raise ValueError("boxes must be at least one point with entries within [0, 1]")
+    must_fit(problem, len(boxes))
     tolerance = _tolerance(tolerance)
     return jax.device_get(_begin(problem, boxes, jnp.full(len(boxes), tolerance, dtype)))
 
@@ -50,6 +52,14 @@ def begin(problem: DesignProblem, boxes: Any, *, tolerance: float | None = None)
 @functools.partial(jax.jit, static_argnums=0)
 def _begin(problem: DesignProblem, boxes: jax.Array, tolerances: jax.Array) -> Search:
     return jax.vmap(functools.partial(lane_at, problem))(boxes, tolerances)
+
+
+def must_fit(problem: DesignProblem, starts: int) -> None:
+    """ValueError where the state of so many starts does not fit into memory."""
+    like = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.zeros(()).dtype)
+    one = jax.eval_shape(functools.partial(_begin, problem), like(1, len(problem.entries)), like(1))
+    size = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(one))
+    checks.fits(f"{starts} starts of {problem.name}", checks.ROOM * size * starts, "take fewer, or in parts")
 
 
 def advance(
@@ -61,7 +71,7 @@ def advance(
               with the same `search` and all devices, and gets the whole answer.
     """
     steps = checks.is_count("steps", steps, most=100_000)
-    devices = jax.local_devices()[:1] if devices is None else list(devices)
+    devices = checks.are_devices("devices", devices)
     processes = {device.process_index for device in devices}
     if jax.process_index() not in processes:
         raise ValueError("devices must hold at least one of this process")
@@ -210,5 +220,5 @@ def _tolerance(tolerance: float | None) -> float:
     if tolerance is None:
         return 1e-8 if jnp.zeros(()).dtype == jnp.float64 else 1e-3
     if not (checks.is_number(tolerance) and 0 < tolerance < 1):
-        raise ValueError(f"tolerance must be a number between 0 and 1, got {tolerance!r}")
+        raise ValueError(f"tolerance must be a number between 0 and 1, got {checks.shown(tolerance)}")
     return float(tolerance)

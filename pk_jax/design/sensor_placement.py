@@ -66,10 +66,11 @@ def place_sensors(
     poses, many = rows_of("poses", poses, home_shapes(stewart)[0])
     poses = poses if many else jax.tree.map(lambda leaf: leaf[None], poses)
     for name, value in (("radius", radius), ("platform_radius", platform_radius)):
-        if value is not None and not (checks.is_number(value) and value > 0):
-            raise ValueError(f"{name} must be positive and finite, got {value}")
+        is_left_out = value is None and name != "radius"
+        if not (is_left_out or (checks.is_number(value) and value > 0)):
+            raise ValueError(f"{name} must be positive and finite, got {checks.shown(value)}")
     if not (checks.is_number(most_condition) and most_condition > 1):
-        raise ValueError(f"most_condition must be greater than 1, got {most_condition}")
+        raise ValueError(f"most_condition must be greater than 1, got {checks.shown(most_condition)}")
     starts = checks.is_count("starts", starts, most=10_000)
     steps = checks.is_count("steps", steps, most=100_000)
     weights = checks.real_array("weights", np.ones(ROWS) if weights is None else weights)
@@ -78,6 +79,9 @@ def place_sensors(
     checks.is_finite("weights", weights)
     for leaf in jax.tree.leaves(poses):
         checks.is_finite("poses", leaf)
+
+    count = len(poses.translation)
+    checks.fits(f"{starts} starts over {count} poses", 8 * 1000 * starts * count, "take fewer of either")
 
     _require_flat(np.asarray(stewart.platform))
     room = _room_of(stewart, radius, platform_radius)

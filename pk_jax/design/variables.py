@@ -135,6 +135,4 @@ _SPACES = {space.name: space for space in (TwoRPRSpace(), TwoRRRSpace())}
 
 def design_space(name: str) -> DesignSpace:
     """The design space of a mechanism family: "2-rpr" or "2-rrr"."""
-    if name not in _SPACES:
-        raise ValueError(f"design space must be one of {', '.join(map(repr, _SPACES))}, got {name!r}")
-    return _SPACES[name]
+    return _SPACES[checks.is_word("design space", name, _SPACES)]

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -32,6 +33,8 @@ _DAMAGED = (
     RuntimeError,  # of an encrypted or unknown member: NotImplementedError, too
     RecursionError,
     struct.error,
+    SyntaxError,  # of the description of an array
+    tokenize.TokenError,
     zipfile.BadZipFile,
     zlib.error,
 )
@@ -73,8 +76,9 @@ def _unpacked(content: bytes) -> Saved:
         names = [member.filename.removesuffix(".npy") for member in members]
         if len(set(names)) < len(names) or HEADER not in names:
             raise ValueError("it must hold one header, and every array once")
-        if any(m.compress_type != zipfile.ZIP_STORED or m.file_size > len(content) for m in members):
-            raise ValueError("an array is said to be larger than the file")
+        is_packed = any(m.compress_type != zipfile.ZIP_STORED for m in members)
+        if is_packed or sum(m.file_size for m in members) > len(content):
+            raise ValueError("its arrays are said to be larger than the file")
         header = json.loads(_read(archive, HEADER, None).tobytes())
         if not isinstance(header, dict) or header.get("format") != FORMAT:
             raise ValueError(f"its format must be {FORMAT}")

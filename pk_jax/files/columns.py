@@ -42,7 +42,7 @@ def arrange(
             for column, places in zip(layout, found, strict=True):
                 if len(places) > 1:
                     raise ValueError(
-                        f"{where}: {' and '.join(repr(names[i]) for i in places)} are both {column.name}"
+                        f"{where}: {' and '.join(short(names[i]) for i in places[:2])} are both {column.name}"
                     )
                 _check_unit(where, names[places[0]], column, unit)
             return layout, [places[0] for places in found]

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from pk_jax import checks
 from pk_jax.analysis.boxes import Certificate
 from pk_jax.analysis.certificate import certify_confined, certify_regular
 from pk_jax.analysis.integral import WorkspaceIntegral, workspace_integral
 from pk_jax.analysis.slices import coordinate_names
-from pk_jax.analysis.workspace_map import ANY, Travel, WorkspaceMap, travel, workspace_map
+from pk_jax.analysis.workspace_map import ANY, MOST_NODES, Travel, WorkspaceMap, travel, workspace_map
 from pk_jax.files.named import Named
 from pk_jax.files.options import ranges_of, signs_of, unit_name, units_of
 from pk_jax.files.rows_file import format_rows
@@ -31,6 +32,8 @@ def map_of(
     nodes: int | None,
 ) -> tuple[WorkspaceMap, dict[str, Travel]]:
     """The map that the command line says, and the travel of every coordinate about the same pose."""
+    if nodes is not None:  # told before the travels are sought
+        checks.is_count("nodes", nodes, least=2, most=MOST_NODES)
     mech, given = named.mechanism, ranges_of(named, ranges)
     free = free if free in (None, ANY) else free_numbers(named, free, (ANY,))
     options = {"at": at, "branch": signs_of(mode), "free": free}

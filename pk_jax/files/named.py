@@ -1,14 +1,16 @@
-"""A mechanism as the command line names it: a catalogue entry or a TOML file, and the unit to speak in."""
+"""A mechanism as the command line names it: a catalogue entry, a TOML file or FILE.py:NAME; and its unit."""
 
 from __future__ import annotations
 
 import difflib
+import inspect
 import os
 import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
 from pk_jax.files.mechanism_file import UNITS, read_mechanism_file
+from pk_jax.files.python_file import is_python, read_python_file, split
 from pk_jax.mechanisms.base import Mechanism
 from pk_jax.mechanisms.catalogue import CATALOGUE
 
@@ -24,15 +26,17 @@ class Named(NamedTuple):
 
 
 def named_mechanism(name: str, unit: str | None = None) -> Named:
-    """The catalogue entry of that name, else the mechanism of that file.
+    """The catalogue entry of that name, else the mechanism of that file. A Python file, FILE.py:NAME, is run.
 
-    `unit`: other than the file's own (a catalogue entry's is m). ValueError where there is no such
-    mechanism or unit, OSError where the file cannot be read.
+    `unit`: other than the file's own (m of a catalogue entry and of a Python file). ValueError where there
+    is no such mechanism or unit, OSError where the file cannot be read.
     """
     if unit is not None and (unit not in UNITS or unit == "1"):
         raise ValueError(f"--unit must be one of {', '.join(u for u in UNITS if u != '1')}, got {unit!r}")
     if name in CATALOGUE:
         mechanism, own, path = CATALOGUE[name].make(), "m", None
+    elif is_python(name):
+        mechanism, own, path = read_python_file(name), "m", split(name)[0]
     elif name.endswith(".toml") or os.path.exists(os.path.expanduser(name)):
         (mechanism, own, _), path = read_mechanism_file(name), os.path.expanduser(name)
     else:
@@ -46,8 +50,10 @@ def named_mechanism(name: str, unit: str | None = None) -> Named:
 
 
 def source_of(named: Named) -> str:
-    """Where the design comes from, as the catalogue or the file says it; empty where it says nothing."""
+    """Where the design comes from, as the catalogue, the file or the class says it; else empty."""
     if named.path is None:
         return CATALOGUE[named.name].source
+    if is_python(named.path):
+        return (inspect.getdoc(type(named.mechanism)) or "").partition("\n")[0]
     table = tomllib.loads(Path(named.path).read_text("utf-8-sig"))
     return ": ".join(table[key] for key in ("name", "source") if table.get(key))

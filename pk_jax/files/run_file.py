@@ -47,6 +47,7 @@ Over the workspace the measure is "mean", "integral" or "volume", and the option
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -98,6 +99,17 @@ class RunFile(NamedTuple):
     @property
     def steps(self) -> int:
         return self.settings["search"]["steps"]
+
+
+def is_run_file(path: str | os.PathLike) -> bool:
+    """Whether a TOML file says a design run and no mechanism. False where it cannot be read."""
+    path = os.path.expanduser(path)
+    with contextlib.suppress(OSError, ValueError, RecursionError):
+        if os.path.isfile(path):  # a pipe can be read but once
+            with open(path, "rb") as file:
+                table = tomllib.loads(file.read(LARGEST).decode("utf-8-sig"))
+            return "family" not in table and any(key in table for key in ("mechanism", *TABLES))
+    return False
 
 
 def read_run(path: str | os.PathLike) -> RunFile:

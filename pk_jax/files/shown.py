@@ -11,6 +11,7 @@ import numpy as np
 
 from pk_jax.files.mechanism_file import ANGLES, DIRECTIONS, NOT_IN_FILES
 from pk_jax.files.named import Named, source_of
+from pk_jax.files.python_file import is_python
 from pk_jax.files.stream import (
     free_of,
     joint_layouts,
@@ -89,9 +90,12 @@ def describe(named: Named) -> str:
     pose, joints = mech.home()
     lines = [named.name, *filter(None, [source_of(named)])]
     lines.append(f"\nfamily {type(mech).__name__}, {_lengths(named.unit)}, angles in rad")
+    own = is_python(named.path)  # of its fields nobody knows which are lengths
+    if own and named.metres != 1:
+        lines.append("fields as in the file, lengths in m")
     for field in dataclasses.fields(mech):
         if (value := getattr(mech, field.name)) is not None and field.name not in NOT_IN_FILES:
-            is_length = field.name not in (*ANGLES, *DIRECTIONS)
+            is_length = not own and field.name not in (*ANGLES, *DIRECTIONS)
             lines += _field(field.name, np.asarray(value) / (named.metres if is_length else 1))
     values = _configuration(named, pose, joints)
     lines += [

@@ -62,6 +62,9 @@ def experiment_of(
     """What the options say; lengths of defaults are in proportion to the platform."""
     mech, metres = named.mechanism, named.metres
     require_nine_rows("simulate", mech)
+    given = set_by(plant, "--plant", Plant(), metres), set_by(gains, "--gain", Gains(), 1.0)
+    check_plant(given[0])
+    check_gains(given[1])
     size = float(mech.length())
     options = {} if duration is None else {"duration": duration}
     if kind == "circle":
@@ -69,9 +72,6 @@ def experiment_of(
         reference = circle_reference(mech, radius=radius, frequency=frequency, **options)
     else:
         reference = step_reference(mech, _twist(twist, size, metres), **options)
-    given = set_by(plant, "--plant", Plant(), metres), set_by(gains, "--gain", Gains(), 1.0)
-    check_plant(given[0])
-    check_gains(given[1])
     return Experiment(named, reference, *given)
 
 
@@ -92,6 +92,7 @@ def runs_of(
 ) -> dict[str, Simulation]:
     """Every feedback on the same machines."""
     seeds = checks.is_count("seeds", seeds, most=100_000)
+    seed = checks.is_count("seed", seed, least=0, most=2**32 - 1)
     found = {}
     for feedback in feedbacks:
         note(f"simulating feedback {feedback}")

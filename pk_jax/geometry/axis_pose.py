@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -11,7 +12,7 @@ import numpy as np
 
 from pk_jax import checks
 from pk_jax.geometry import rotations
-from pk_jax.geometry.se3 import check_rotations, register
+from pk_jax.geometry.se3 import check_rotations, poses_of, register
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +54,10 @@ class AxisPose:
     def __getitem__(self, row: Any) -> AxisPose:
         """Rows of a batch."""
         return jax.tree.map(lambda leaf: leaf[row], self)
+
+    def __iter__(self) -> Iterator[AxisPose]:
+        """The poses of a batch."""
+        return poses_of(self)
 
 
 register(AxisPose)

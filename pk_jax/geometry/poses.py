@@ -93,11 +93,13 @@ def difference(pose: Pose, other: Pose) -> jax.Array:
     return other - pose
 
 
-def features(poses: Pose, declared: tuple[int, ...] | None, length: float) -> np.ndarray:
+def features(
+    poses: Pose, declared: tuple[int, ...] | None, length: float, *, come_round: bool = True
+) -> np.ndarray:
     """Known poses, batch first, as points (k, f) whose distances are those of the poses, without units.
 
-    Of positions over `length`, and of turns by their chords, so that a full turn is none. `declared` as
-    for `pose_units`.
+    Of positions over `length`, and of turns by their chords, so that a full turn is none; angles that do not
+    `come_round` as they are. `declared` as for `pose_units`.
     """
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(poses)]
     if isinstance(poses, Turning):
@@ -105,7 +107,8 @@ def features(poses: Pose, declared: tuple[int, ...] | None, length: float) -> np
         return np.concatenate([shift / length, rotation / np.sqrt(2)], axis=1)
     units = (1,) * leaves[0].shape[1] if declared is None else declared
     angles, shifts = (leaves[0][:, np.equal(units, unit)] for unit in (0, 1))
-    return np.concatenate([shifts / length, np.cos(angles), np.sin(angles)], axis=1)
+    turns = [np.cos(angles), np.sin(angles)] if come_round else [angles]
+    return np.concatenate([shifts / length, *turns], axis=1)
 
 
 def tangent_size(pose: Pose) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -64,6 +65,10 @@ class SE3:
         """Rows of a batch."""
         return jax.tree.map(lambda leaf: leaf[row], self)
 
+    def __iter__(self) -> Iterator[SE3]:
+        """The poses of a batch."""
+        return poses_of(self)
+
 
 def register(cls: type) -> None:
     """Make a pose class a pytree. JAX rebuilds it with tracers, and only callers meet __post_init__."""
@@ -83,6 +88,13 @@ def register(cls: type) -> None:
         return pose
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+
+
+def poses_of(batch: Any) -> Iterator[Any]:
+    """One pose after the other; without it `for` would ask for rows without end, which JAX has."""
+    if batch.rotation.ndim != 3:
+        raise TypeError(f"one {type(batch).__name__} is no batch")
+    return (batch[row] for row in range(len(batch.rotation)))
 
 
 register(SE3)

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from pk_jax.geometry.poses import pose_units, position
-from pk_jax.kinematics.jacobian import joint_jacobian, units
+from pk_jax.kinematics.jacobian import joint_jacobian
 from pk_jax.mechanisms.base import Mechanism
+from pk_jax.mechanisms.regular import units
 
 ROUNDOFFS = 256  # the residual of an exact configuration may be this many roundings of its terms
 INCONSISTENT_ABOVE = 1e-6  # of the size of each closure equation, for redundant mechanisms
@@ -28,12 +29,15 @@ def joint_scale(mech: Mechanism, joints: jax.Array) -> jax.Array:
     return jnp.where(unit > 0, mech.length() + jnp.max(jnp.abs(joints) * unit), 1)
 
 
-def closure(mech: Mechanism, pose: Any, joints: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """F (c,), A (c, n), and () whether the equations hold: to roundoff, or redundant ones to 1e-6."""
+def closure(
+    mech: Mechanism, pose: Any, joints: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """F (c,), A (c, n), and () whether the equations hold: redundant ones to 1e-6, and to roundoff."""
     value, jacobian, size, of_pose = _sizes(mech, pose, joints)
+    is_exact = _is_within(value, closed_to(value.dtype) * size)
     if jacobian.shape[0] == jacobian.shape[1]:
-        return value, jacobian, _is_within(value, closed_to(value.dtype) * size)
-    return value, jacobian, _is_within(value, INCONSISTENT_ABOVE * of_pose)
+        return value, jacobian, is_exact, is_exact
+    return value, jacobian, _is_within(value, INCONSISTENT_ABOVE * of_pose), is_exact
 
 
 def is_closed(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:

@@ -27,13 +27,12 @@ from pk_jax.kinematics.batching import (
 from pk_jax.kinematics.certify import certify as prove
 from pk_jax.kinematics.certify import check_known
 from pk_jax.kinematics.closure import pose_scale
-from pk_jax.kinematics.in_blocks import redo
+from pk_jax.kinematics.in_blocks import AGAIN, redo
 from pk_jax.kinematics.lane_newton import Home
 from pk_jax.kinematics.lanes import is_entries, split, stack
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.status import Status
 
-AGAIN = 64  # lost rows of a traced batch that are solved again at a time
 WORTH_LANES = 4096  # rows of a traced batch
 
 
@@ -289,7 +288,7 @@ def _again(
     lost = np.flatnonzero(np.asarray(found.status) == Status.STALLED)
     _warn_of_units(mech, joints[lost], np.asarray(home.joints))
     found = jax.tree.map(lambda leaf: np.array(leaf), found)
-    redo(partial(_persist_rows, mech, home), lost, (joints, guess), found, most=1024)
+    redo(partial(_persist_rows, mech, home), lost, (joints, guess), found)
     return found
 
 

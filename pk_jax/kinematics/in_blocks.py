@@ -16,6 +16,7 @@ import numpy as np
 BLOCK = 8192  # rows of one call at most; on an accelerator they are the lanes, all at once
 ON_ACCELERATOR = 1 << 16
 WORTH_A_THREAD = 4096  # rows
+AGAIN = 64  # rows of one call that solves lost ones once more
 
 
 def block_size() -> int:
@@ -42,15 +43,15 @@ def in_blocks(run: Callable[[int, int], None], count: int, block: int, workers: 
         helper.result()
 
 
-def redo(call: Callable, rows: np.ndarray, given: Any, found: Any, most: int) -> None:
+def redo(call: Callable, rows: np.ndarray, given: Any, found: Any) -> None:
     """`call(*given, found)` once more for some rows, its answers written into `found`.
 
-    In blocks of two sizes, 16 and `most`, so that few are compiled. Trees of NumPy arrays, rows first.
+    In blocks of one size: no bit of a row depends on how many others are lost. Trees of NumPy arrays, rows
+    first.
     """
-    size = 16 if len(rows) <= 16 else most
-    for first in range(0, len(rows), size):
-        these = rows[first : first + size]
-        filled = np.resize(these, size)
+    for first in range(0, len(rows), AGAIN):
+        these = rows[first : first + AGAIN]
+        filled = np.resize(these, AGAIN)
         taken = jax.tree.map(lambda leaf, filled=filled: leaf[filled], (given, found))
         answers = call(*taken[0], taken[1])
         for whole, part in zip(jax.tree.leaves(found), jax.tree.leaves(answers), strict=True):

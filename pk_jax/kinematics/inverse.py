@@ -71,9 +71,10 @@ def free_rows(mech: Mechanism, free: Any) -> tuple[jax.Array, bool]:
 
 def _warn_of_units(mech: Mechanism, pose: Any) -> None:
     """Positions a hundred times as far as the mechanism is large are most likely in another unit."""
-    is_length = np.asarray(pose_units(pose, mech.pose_units), bool)
+    is_length = np.asarray(pose_units(home_shapes(mech)[0], mech.pose_units), bool)
     at = np.asarray(position(pose))
-    far = np.linalg.norm(at[..., is_length[: at.shape[-1]]], axis=-1)
+    with np.errstate(over="ignore"):
+        far = np.linalg.norm(at[..., is_length[: at.shape[-1]]], axis=-1)
     far = far[np.isfinite(far)]
     if far.size:
         what = f"positions and {type(mech).__name__}.length()"

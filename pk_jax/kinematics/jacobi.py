@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import reduce
+from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
@@ -16,7 +17,8 @@ SWEEPS = 16  # convergence is quadratic: three to seven are taken
 def orthogonal_rows(matrix: Matrix) -> Matrix:
     """U^T A of A = U S V^T: rows turned among one another until they are orthogonal. (c, n) -> (c, n)
 
-    Their lengths are the singular values, in no order. All entries are whole lanes.
+    Their lengths are the singular values, in no order. All entries are whole lanes; one that is done stays as
+    it is, so that its bits don't depend on the others.
     """
     width = len(matrix[0])
     pairs = [(i, j) for j in range(len(matrix)) for i in range(j)]
@@ -27,13 +29,15 @@ def orthogonal_rows(matrix: Matrix) -> Matrix:
         return (sweep < SWEEPS) & jnp.any(aslant > eps)
 
     def turn(state):
-        sweep, items, _ = state
+        sweep, items, before = state
         rows = [items[i * width : (i + 1) * width] for i in range(len(matrix))]
         aslant = []
         for i, j in pairs:
             rows[i], rows[j], off = _turned(rows[i], rows[j])
             aslant.append(off)
-        return sweep + 1, [item for row in rows for item in row], reduce(jnp.maximum, aslant)
+        stay = lambda new, old: jnp.where(before > eps, new, old)
+        turned = [item for row in rows for item in row]
+        return sweep + 1, list(map(stay, turned, items)), stay(reduce(jnp.maximum, aslant), before)
 
     items = [item for row in matrix for item in row]
     if pairs:
@@ -43,6 +47,15 @@ def orthogonal_rows(matrix: Matrix) -> Matrix:
 
 def lengths(rows: Matrix) -> list[Lane]:
     return [jnp.sqrt(total([v * v for v in row])) for row in rows]
+
+
+def least_singular_value(matrix: Any) -> Lane:
+    """Of a small matrix (c, n), c >= n, whatever is mapped over it; it calls no LAPACK. -> ()
+
+    Batched calls of LAPACK that don't wait for one another can block each other for good on a CPU.
+    """
+    columns = [[matrix[i, j] for i in range(matrix.shape[0])] for j in range(matrix.shape[1])]
+    return reduce(jnp.minimum, lengths(orthogonal_rows(columns)))
 
 
 def _turned(first: list[Lane], second: list[Lane]) -> tuple[list[Lane], list[Lane], Lane]:

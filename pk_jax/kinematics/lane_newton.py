@@ -20,9 +20,10 @@ from pk_jax.kinematics import elimination
 from pk_jax.kinematics.closure import closure, pose_scale
 from pk_jax.kinematics.elimination import Matrix, Order, Reference
 from pk_jax.kinematics.entrywise import Invariants, entrywise
-from pk_jax.kinematics.jacobian import SINGULAR_BELOW, scaled_jacobians, units
+from pk_jax.kinematics.jacobian import SINGULAR_BELOW, scaled_jacobians
 from pk_jax.kinematics.lanes import Entries, Lane, is_entries, items_of, over, rebuilt, times, total
 from pk_jax.mechanisms.base import LegMechanism, Mechanism
+from pk_jax.mechanisms.regular import units
 from pk_jax.status import Status
 
 STEPS = 10
@@ -42,6 +43,7 @@ class Judged(NamedTuple):
 
     residual: Lane  # |F|
     is_closed: Lane  # square: F is zero to roundoff; redundant: the equations agree to 1e-6
+    is_exact: Lane  # F is zero to roundoff: of redundant equations, too, nothing is left to minimize
     sigma_min: Lane  # at most the least singular value of A without units, at least it over sqrt(n)
     sign: Lane  # of det A; 0 where the actuated equations are redundant
 
@@ -123,6 +125,7 @@ def verdict(judged: Judged, is_stationary: Lane, side: Lane, *, is_square: bool)
         status = jnp.where(judged.is_closed, Status.OK, Status.STALLED)
         status = jnp.where(judged.is_closed & (side < 0), Status.OTHER_MODE, status)
     else:
+        is_stationary = is_stationary | judged.is_exact
         status = jnp.where(judged.is_closed, Status.OK, Status.INCONSISTENT)
         status = jnp.where(is_stationary, status, Status.STALLED)
     is_solved = judged.is_closed & (is_square | is_stationary)
@@ -232,7 +235,7 @@ def judge(
 ) -> Judged:
     """The equations at `pose`, evaluated afresh, and how far from a singularity it is."""
     like = joints.items[0]
-    value, jacobian, is_closed = entrywise(closure, mech, pose, joints)
+    value, jacobian, is_closed, is_exact = entrywise(closure, mech, pose, joints)
     rows = jacobian.rows()
     residual = jnp.sqrt(total([times(f, f) for f in value.items]))
     is_square = len(rows) == len(rows[0])
@@ -256,15 +259,17 @@ def judge(
         columns = [elimination.back_substitute(upper, [float(i == k) for i in range(n)]) for k in range(n)]
         entries = [item for column in columns for item in column]
     sigma = 1 / jnp.sqrt(total([times(a, a) for a in entries]))
-    return Judged(residual, is_closed.items[0], jnp.where(jnp.isfinite(sigma), sigma, 0), sign)
+    sigma = jnp.where(jnp.isfinite(sigma), sigma, 0)
+    return Judged(residual, is_closed.items[0], is_exact.items[0], sigma, sign)
 
 
 def judge_one(mech: Mechanism, joints: jax.Array, pose: Any) -> Judged:
     """The same for one row, in ordinary arrays: for where compiling costs more than computing."""
-    value, jacobian, is_closed = closure(mech, pose, joints)
+    value, jacobian, is_closed, is_exact = closure(mech, pose, joints)
     sigmas = jnp.linalg.svd(scaled_jacobians(mech, pose, joints).pose, compute_uv=False)
     sigma = 1 / jnp.sqrt(jnp.sum(1 / sigmas**2))
-    return Judged(jnp.linalg.norm(value), is_closed, sigma, sign_of_det(jacobian, mech.actuated_rows))
+    sign = sign_of_det(jacobian, mech.actuated_rows)
+    return Judged(jnp.linalg.norm(value), is_closed, is_exact, sigma, sign)
 
 
 def start_sign(mech: Any, joints: Entries, start: Any, by: Order | Reference, actuated: int | None) -> Lane:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from pk_jax.geometry.poses import difference, retract, tangent_size, tangent_zero
+from pk_jax.geometry.poses import Turning, difference, pose_units, retract, tangent_size, tangent_zero
 from pk_jax.geometry.spread import evenly
 from pk_jax.kinematics.closure import INCONSISTENT_ABOVE, is_closed, joint_scale, pose_scale
 from pk_jax.kinematics.entrywise import entrywise
@@ -17,7 +17,7 @@ from pk_jax.kinematics.forward import forward_kinematics
 from pk_jax.kinematics.inverse import inverse_kinematics
 from pk_jax.kinematics.jacobian import joint_jacobian, pose_jacobian, scaled_jacobians
 from pk_jax.kinematics.lanes import split, stack
-from pk_jax.mechanisms.base import Mechanism, require_mechanism
+from pk_jax.mechanisms.base import Mechanism, Skeleton, require_mechanism
 from pk_jax.status import Status
 
 SAMPLES = 12
@@ -64,7 +64,10 @@ def check_mechanism(mech: Mechanism) -> LawReport:
 
 
 def _check_contract(mech: Mechanism, name: str) -> None:
-    pose, joints = mech.home()
+    home = mech.home()
+    if not isinstance(home, tuple) or len(home) != 2:
+        raise ValueError(f"{name}.home must be (pose, joints), got {type(home).__name__}")
+    pose, joints = home
     _arrays(f"{name}.home", *jax.tree.leaves((pose, joints)))
     (value,) = _arrays(f"{name}.residual", mech.residual(pose, joints))
     _arrays(f"{name}.length", mech.length())
@@ -76,6 +79,16 @@ def _check_contract(mech: Mechanism, name: str) -> None:
             raise ValueError(
                 f"{name}.{attribute} must be {count} numbers, 1 = length and 0 = angle, got {units}"
             )
+    if m - mech.free_joints < n:
+        raise ValueError(
+            f"{name} has {m - mech.free_joints} joints for a pose of {n} coordinates: let the pose have the "
+            "platform's own freedoms and no constraint (as in examples/three_rps.py)"
+        )
+    if (which := _not_round(mech, pose, joints)) is not None:
+        raise ValueError(
+            f"{name} closes no more after a full turn of coordinate {which + 1} of its pose: say "
+            "angles_come_round = False"
+        )
     if m - mech.free_joints > c:
         raise ValueError(
             f"{name} has {m} joints in {c} closure equations: the last {m - c} must be its free_joints"
@@ -97,7 +110,13 @@ def _check_contract(mech: Mechanism, name: str) -> None:
     margins = mech.margins(pose, joints)
     if not isinstance(margins, dict):
         raise ValueError(f"{name}.margins must be a dict of named arrays, got {type(margins).__name__}")
-    points, segments, ground = mech.skeleton(pose, joints)
+    for which, margin in margins.items():
+        _arrays(f"{name}.margins[{which!r}]", margin)
+    skeleton = mech.skeleton(pose, joints)
+    if not isinstance(skeleton, Skeleton):
+        raise ValueError(f"{name}.skeleton must be a pk_jax.Skeleton, got {type(skeleton).__name__}")
+    points, segments, ground = skeleton
+    _arrays(f"{name}.skeleton points", points)
     if points.ndim != 2 or points.shape[1] not in (2, 3):
         raise ValueError(f"{name}.skeleton points must have shape (p, 2) or (p, 3), got {points.shape}")
     indices = {index for segment in segments for index in segment} | set(ground)
@@ -114,6 +133,22 @@ def _check_contract(mech: Mechanism, name: str) -> None:
                 f"{name}.forward must give poses (modes, *{wanted}) and is_real (modes,), "
                 f"got {shapes} and {is_real.shape}"
             )
+
+
+def _not_round(mech: Mechanism, pose: Any, joints: jax.Array) -> int | None:
+    """The first angle of the pose that claims to come round after a full turn, and does not."""
+    angles = np.flatnonzero(np.equal(pose_units(pose, mech.pose_units), 0))
+    if isinstance(pose, Turning) or not mech.angles_come_round or not len(angles):
+        return None
+    turns = np.zeros((len(angles) + 1, len(pose)))  # none, and one of each
+    turns[np.arange(len(angles)) + 1, angles] = 2 * np.pi
+    closes = _close(mech, pose + jnp.asarray(turns, joints.dtype), joints)
+    return int(angles[np.argmin(closes[1:])]) if closes[0] and not np.all(closes) else None
+
+
+@jax.jit
+def _close(mech: Mechanism, poses: Any, joints: jax.Array) -> jax.Array:
+    return jax.vmap(lambda pose: is_closed(mech, pose, joints))(poses)
 
 
 def _arrays(name: str, *values: Any) -> tuple[Any, ...]:

@@ -85,8 +85,8 @@ def nine_length_pose(
     Source: Ryu et al., patent application KR 10-2000-0073215, both embodiments.
     """
     require_nine_rows("nine_length_pose", stewart)
-    if method is not None and method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    if method is not None:
+        checks.is_word("method", method, METHODS)
     is_known = checks.is_concrete((stewart, lengths, weights)) and not checks.is_staged()
     one = jax.ShapeDtypeStruct((ROWS,), stewart.base.dtype)
     lengths, many = rows_of("lengths", lengths, one, numpy=is_known)
@@ -126,6 +126,8 @@ def nine_length_candidates(
     Lengths as for `nine_length_pose`; candidates of bad ones are NaN.
     """
     require_nine_rows("nine_length_candidates", stewart)
+    if method is not None:
+        checks.is_word("method", method, METHODS)
     lengths, many = rows_of("lengths", lengths, jax.ShapeDtypeStruct((ROWS,), stewart.base.dtype))
     if not checks.is_concrete(stewart):
         raise ValueError("nine_length_candidates takes a Stewart with known values")
@@ -261,7 +263,7 @@ def _known_rows(
         as_pose(t, r), as_pose(start_t, start_r), covariance, status, squared, residual, steps, sigma
     )
     lost = np.flatnonzero(status == Status.STALLED)
-    redo(partial(_persist_rows, stewart, stage), lost, (lengths, weights), found, most=256)
+    redo(partial(_persist_rows, stewart, stage), lost, (lengths, weights), found)
     return _answer(stewart, found)
 
 

@@ -29,9 +29,9 @@ from pk_jax.kinematics.jacobian import (
     pose_jacobian,
     scaled_jacobians,
     self_motions,
-    units,
 )
 from pk_jax.mechanisms.base import LegMechanism, Mechanism, require_mechanism
+from pk_jax.mechanisms.regular import units
 from pk_jax.status import Status
 
 A_COUPLE = 1e-9  # force over moment / length() below which a wrench is a pure couple
@@ -107,6 +107,7 @@ def stiffness(mech: Mechanism, pose: Any, joints: Any, k: Any) -> jax.Array:
     with the others, as much as costs least energy. NaN at a type I singularity.
     Source: Gosselin 1990, IEEE Trans. Robotics and Automation 6(3).
     """
+    require_mechanism("stiffness", mech)
     _, joints_like = home_shapes(mech)
     if not isinstance(k, jax.core.Tracer):
         k = checks.real_numpy("k", k)
@@ -134,6 +135,7 @@ def bounded_joint_forces(
     bounds are compared, which is every face that can hold the optimum of a strictly convex
     quadratic program. At most three degrees of redundancy.
     """
+    require_mechanism("bounded_joint_forces", mech)
     _, joints_like = home_shapes(mech)
     bounds = []
     for name, bound in (("lower", lower), ("upper", upper)):

@@ -20,7 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pk_jax import checks
-from pk_jax.geometry.poses import place, place_jacobian, retract, tangent_zero
+from pk_jax.geometry.poses import place, place_jacobian, retract, tangent_size, tangent_zero
+from pk_jax.mechanisms.declared import check_attributes, check_fields, require_complete
 
 
 class Skeleton(NamedTuple):
@@ -41,15 +42,18 @@ class Mechanism(abc.ABC):
 
     joint_units: ClassVar[tuple[int, ...] | None] = None  # 1 = length, 0 = angle; None = all lengths
     pose_units: ClassVar[tuple[int, ...] | None] = None  # the same for the tangent of an array pose
+    angles_come_round: ClassVar[bool] = True  # those of the pose: a full turn is none
     joints_are_distances: ClassVar[bool] = False  # joints that are not positive make no sense
-    actuated_rows: ClassVar[int | None] = None  # the first so many equations carry force; None = all
+    actuated_rows: ClassVar[int | None] = None  # the first so many equations carry force (others: sensors)
     free_joints: ClassVar[int] = 0  # the last so many joints: a pose leaves them free (kinematic redundancy)
     joint_names: ClassVar[tuple[str, ...] | None] = None  # for files; default: q1, q2, ... or l1, l2, ...
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        check_attributes(cls)
         dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)(cls)
         names = tuple(field.name for field in dataclasses.fields(cls))
+        check_fields(cls, names)
 
         keys = tuple(map(jax.tree_util.GetAttrKey, names))
 
@@ -68,6 +72,13 @@ class Mechanism(abc.ABC):
 
         jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
 
+    def __new__(cls, *values: Any, **fields: Any) -> Mechanism:
+        require_complete(cls)
+        if values:
+            named = ", ".join(f"{field.name}=..." for field in dataclasses.fields(cls))
+            raise TypeError(f"{cls.__name__} takes its geometry by name: {cls.__name__}({named})")
+        return super().__new__(cls)
+
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
@@ -75,12 +86,22 @@ class Mechanism(abc.ABC):
                 array = checks.real_array(f"{type(self).__name__}.{field.name}", value)
                 object.__setattr__(self, field.name, array)
         self.check_shapes()
+        if self.actuated_rows is not None:
+            self._check_actuated_rows()
         if checks.is_concrete(self):
             with checks.known_values():
                 for field in dataclasses.fields(self):
                     if (value := getattr(self, field.name)) is not None:
                         checks.is_finite(f"{type(self).__name__}.{field.name}", value)
                 self.check_values()
+
+    def _check_actuated_rows(self) -> None:
+        freedoms = tangent_size(jax.eval_shape(lambda mech: mech.home()[0], self))
+        if self.actuated_rows < freedoms:
+            raise ValueError(
+                f"{type(self).__name__}.actuated_rows must be at least {freedoms}, the coordinates of its "
+                f"pose, got {self.actuated_rows}: equations of constraints carry force, too"
+            )
 
     def __repr__(self) -> str:
         def show(value):

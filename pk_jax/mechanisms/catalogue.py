@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pk_jax import checks
 from pk_jax.mechanisms.base import Mechanism
 from pk_jax.mechanisms.casing_oscillator import CasingOscillator
 from pk_jax.mechanisms.five_bar import FiveBar
@@ -192,6 +193,6 @@ CATALOGUE: dict[str, Entry] = {
 
 def catalogued(name: str) -> Mechanism:
     """The mechanism of a catalogue entry."""
-    if name not in CATALOGUE:
-        raise ValueError(f"no catalogue entry {name!r}; there are {', '.join(CATALOGUE)}")
+    if not isinstance(name, str) or name not in CATALOGUE:
+        raise ValueError(f"no catalogue entry {checks.shown(name)}; there are {', '.join(CATALOGUE)}")
     return CATALOGUE[name].make()

@@ -15,6 +15,7 @@ from pk_jax.geometry.matrices import least_direction, small_inverse
 from pk_jax.geometry.poses import place
 from pk_jax.geometry.se3 import SE3
 from pk_jax.mechanisms.base import LegMechanism, Skeleton
+from pk_jax.mechanisms.regular import require_regular_home
 
 LEGS = 6
 SINGULAR_BELOW = 1e-6  # least singular value, without units, below which a platform is of no use
@@ -104,7 +105,7 @@ class Stewart(LegMechanism):
             if (cone := getattr(self, name)) is not None and not np.all((cone > 0) & (cone <= np.pi)):
                 raise ValueError(f"Stewart.{name} must be in (0, pi] rad, got {np.asarray(cone).tolist()}")
         if self.cone_axes is not None and not np.allclose(
-            np.linalg.norm(self.cone_axes, axis=-1), 1, rtol=0, atol=1e-6
+            jnp.linalg.norm(self.cone_axes, axis=-1), 1, rtol=0, atol=1e-6
         ):
             raise ValueError("Stewart.cone_axes must be unit vectors")
         if not float(_best_home(self)[1]) > SINGULAR_BELOW:
@@ -112,6 +113,7 @@ class Stewart(LegMechanism):
                 "Stewart.base and platform are architecturally singular: the six legs are dependent in every "
                 "pose (affine copies of one hexagon, for example), got a least singular value below 1e-6"
             )
+        require_regular_home(self)
 
     def attachments(self) -> jax.Array:
         return self.platform

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from pk_jax.analysis.loci import SingularityLocus
 from pk_jax.analysis.singularity import SingularityKind, classify_singularity, scaled_rows
 from pk_jax.geometry.axis_pose import AxisPose
-from pk_jax.geometry.poses import place, pose_units, position
+from pk_jax.geometry.poses import Turning, place, pose_units, position
 from pk_jax.kinematics.statics import screws
 from pk_jax.mechanisms.base import LegMechanism, Mechanism
 from pk_jax.viz.skeleton import draw
@@ -53,10 +53,14 @@ def draw_screws(mech: Mechanism, pose: Any, joints: jax.Array, ax: Axes | None =
     At a type II singularity the motion that stays free with the actuators locked is drawn too: the pole that
     the platform turns about (a cross), the direction that it slides in (an arrow), or the axis through
     the base's origin of an `AxisPose`. The lines go through the platform's origin where the pose has no turn.
+    ValueError for a pose that is no position: its wrenches are not lines in space.
     """
     ax = draw(mech, pose, joints, ax)
     points = np.asarray(mech.skeleton(pose, joints).points)
     d = points.shape[1]
+    is_position = pose_units(pose, mech.pose_units) in (((1, 1), (1, 1, 0)) if d == 2 else ((1, 1, 1),))
+    if not isinstance(pose, Turning) and not is_position:
+        raise ValueError(f"draw_screws needs a pose that is a position, that of {type(mech).__name__} is not")
     centre, size = (points.max(0) + points.min(0)) / 2, np.ptp(points, axis=0).max()
     reach = 3 * size if d == 2 else 0.75 * size  # in the plane the frame cuts it
     for foot, force in _lines(mech, pose, joints, d):

@@ -8,7 +8,8 @@ import jax
 import numpy as np
 from matplotlib.axes import Axes
 
-from pk_jax.mechanisms.base import Mechanism
+from pk_jax.kinematics.batching import configurations
+from pk_jax.mechanisms.base import Mechanism, require_mechanism
 from pk_jax.viz.style import INK, axes_or_new
 
 
@@ -18,6 +19,10 @@ def draw(mech: Mechanism, pose: Any, joints: jax.Array, ax: Axes | None = None, 
     Lengths in the mechanism's unit, equal on all axes. A skeleton in space needs 3-D axes, which
     are made where `ax` is left out. `line` goes to `Axes.plot` (color, linewidth, alpha, ...).
     """
+    require_mechanism("draw", mech)
+    (pose, joints), are_batched = configurations(mech, pose, joints)
+    if any(are_batched):
+        raise ValueError("draw takes one configuration, got a batch")
     skeleton = mech.skeleton(pose, joints)
     points = np.asarray(skeleton.points)
     is_spatial = points.shape[-1] == 3

@@ -260,7 +260,8 @@ def _certified(mech: Mechanism, modes: AssemblyModes, joints: np.ndarray) -> tup
 
 def _apart(mech: Mechanism, poses: Any, others: Any) -> np.ndarray:
     """Distances without units: of positions over length(), and of turns. -> (k, l)"""
-    here, there = (features(each, mech.pose_units, float(mech.length())) for each in (poses, others))
+    of = lambda each: features(each, mech.pose_units, float(mech.length()), come_round=mech.angles_come_round)
+    here, there = of(poses), of(others)
     return np.linalg.norm(here[:, None] - there[None], axis=2)
 
 

@@ -85,8 +85,9 @@ def connect_modes(
 
     Needs float64, known values and a closed form `inverse`. ValueError for others, and for many rows.
     """
+    checks.is_count("nodes", nodes, most=10**9)
+    checks.fits(f"nodes = {nodes}", 8 * 3 * (5 * nodes) ** 2, "take fewer")
     joints = _checked(mech, joints, modes)
-    checks.is_count("nodes", nodes)
     home, home_joints = jax.device_get(mech.home())
     ends = _joined(_lone(home), jax.device_get(modes.poses))  # row 0 is home, row k + 1 slot k
     slots = len(modes.is_real)
@@ -254,8 +255,12 @@ def _between(mech: Mechanism, pose: Any, other: Any, along: jax.Array) -> Any:
         turned = rotations.from_rotation_vector(along * turn) @ pose.rotation
         return like(pose, shift + along * (end - shift), turned)
     step = other - pose
-    is_length = np.asarray(pose_units(pose, mech.pose_units)) > 0
-    return pose + along * jnp.where(is_length, step, jnp.arctan2(jnp.sin(step), jnp.cos(step)))
+    return pose + along * jnp.where(_is_straight(mech, pose), step, jnp.arctan2(jnp.sin(step), jnp.cos(step)))
+
+
+def _is_straight(mech: Mechanism, pose: Any) -> np.ndarray:
+    """Which coordinates of an array pose do not come round after a full turn. -> (n,)"""
+    return (np.asarray(pose_units(pose, mech.pose_units)) > 0) | (not mech.angles_come_round)
 
 
 def _gaps(seen: _Seen) -> np.ndarray:
@@ -329,7 +334,7 @@ def _neighbours(mech: Mechanism, points: Any, ends: int) -> np.ndarray:
 
 
 def _features(mech: Mechanism, poses: Any) -> np.ndarray:
-    return features(poses, mech.pose_units, float(mech.length()))
+    return features(poses, mech.pose_units, float(mech.length()), come_round=mech.angles_come_round)
 
 
 def _apart(points: np.ndarray) -> np.ndarray:
@@ -432,8 +437,7 @@ def _path(mech: Mechanism, way: list[_Seen]) -> tuple[Any, float]:
     whole = _joined(way[0], *(_rows(seen, slice(1, None)) for seen in way[1:]))
     poses = whole.poses
     if not isinstance(poses, Turning):
-        is_length = np.asarray(pose_units(poses[0], mech.pose_units)) > 0
-        poses = np.where(is_length, poses, np.unwrap(poses, axis=0))
+        poses = np.where(_is_straight(mech, poses[0]), poses, np.unwrap(poses, axis=0))
     return jax.tree.map(jnp.asarray, poses), float(whole.sigma.min())
 
 

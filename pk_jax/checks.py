@@ -85,7 +85,9 @@ def has_shape(name: str, value: jax.Array, shape: tuple[int | None, ...]) -> Non
 def is_number(value: Any) -> bool:
     """Whether `value` is one finite real number; bools are none."""
     is_real = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    return is_real and bool(abs(value) <= sys.float_info.max)  # NaN compares False
+    if is_real and isinstance(value, int | np.integer):
+        return bool(abs(value) <= sys.float_info.max)
+    return is_real and math.isfinite(value)
 
 
 def is_finite(name: str, value: jax.Array) -> None:

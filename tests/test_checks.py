@@ -181,6 +181,62 @@ def test_a_long_value_is_cut_short():
     assert len(str(caught.value)) < 120 and "\n" not in str(caught.value)
 
 
+def test_sixty_characters_are_shown_and_no_more():
+    assert checks.shown("x" * 58) == repr("x" * 58)
+    assert checks.shown("x" * 59) == "'" + "x" * 56 + "..."
+    assert checks.shown("a\n  b") == r"'a\n b'" and checks.shown(np.ones((2, 1))) == "array([[1.], [1.]])"
+
+
+def test_a_shape_says_where_any_size_will_do():
+    checks.has_shape("base", np.zeros((5, 3)), (None, 3))
+    for shape in ((5, 2), (3,), (1, 5, 3)):
+        with pytest.raises(ValueError) as caught:
+            checks.has_shape("base", np.zeros(shape), (None, 3))
+        assert str(caught.value) == f"base must have shape (any, 3), got {shape}"
+
+
+def test_what_is_computed_from_known_values_is_known_within_jit_too():
+    def known(x):
+        assert checks.is_staged() and not checks.is_concrete(jnp.ones(3) * 2)
+        with checks.known_values():
+            assert checks.is_concrete(jnp.ones(3) * 2) and not checks.is_concrete(x)
+        return x
+
+    assert not checks.is_staged() and jax.jit(known)(1.0) == 1.0
+
+
+@pytest.mark.parametrize("ratio", [1 / 101, 101.0, np.nan, np.inf, 0.0])
+def test_units_that_differ_are_warned_of_where_the_caller_is(ratio):
+    with pytest.warns(UserWarning, match="legs and base differ .* are they in one unit") as caught:
+        checks.warn_of_units("legs and base", ratio, stacklevel=1)
+    assert [warning.filename for warning in caught] == [__file__]
+    for fine in (1 / 100, 1.0, 100.0):
+        checks.warn_of_units("legs and base", fine, stacklevel=1)  # warnings are errors here
+
+
+def test_zero_is_not_positive_and_a_bool_no_number():
+    with pytest.raises(ValueError, match=r"^x must be positive, got \[1\. 0\.\]$"):
+        checks.is_positive("x", np.array([1.0, 0.0]))
+    assert [
+        checks.is_number(x) for x in (10**24, 2.5, np.float32(3), True, np.nan, np.inf, "1", [1.0], 10**400)
+    ] == ([True] * 3 + [False] * 6)
+
+
+def test_what_does_not_fit_into_memory_is_told_with_its_size(monkeypatch):
+    monkeypatch.setattr(checks, "_memory", lambda: 2e9)
+    checks.fits("nodes = 9", 2e9, "take fewer")
+    with pytest.raises(ValueError) as caught:
+        checks.fits("nodes = 99", 2.5e9, "take fewer")
+    assert str(caught.value) == "nodes = 99 would take 2.5 GB of memory, there are 2: take fewer"
+
+
+def test_words_are_a_string_or_a_sequence():
+    assert checks.are_words("axes", "x,y") == ("x", "y") == checks.are_words("axes", ["x", "y"])
+    for bad in (3, ["x", 1], None):
+        with pytest.raises(ValueError, match=r"^axes must be names, got "):
+            checks.are_words("axes", bad)
+
+
 @pytest.mark.parametrize(
     "function", [pk.inverse_kinematics, pk.forward_kinematics, pk.local_indices], ids=lambda f: f.__name__
 )

@@ -14,7 +14,7 @@ PY := .venv/bin/python
 # Non-empty when .venv is missing, incomplete, or made from other locks, elsewhere, or by another PYTHON.
 STALE = $(shell PYTHON='$(PYTHON)' sh tools/setup_venv.sh check >/dev/null 2>&1 || echo stale)
 
-.PHONY: help setup reproduce test soak bench coverage mutants lint format notebooks lock clean FORCE
+.PHONY: help setup reproduce test soak oldest bench coverage mutants lint format notebooks lock clean FORCE
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -34,6 +34,11 @@ test: .venv/.ready ## run the test suite
 
 soak: .venv/.ready ## run the long randomized tests
 	$(PY) -m pytest -m soak $(ARGS)
+
+oldest: .venv/.ready ## run the test suite with the oldest versions that pyproject.toml allows
+	.venv/bin/uv venv --quiet --allow-existing --python $(PY) .oldest
+	.venv/bin/uv pip install --quiet --python .oldest --resolution lowest-direct -e '.[test,bench,notebooks]'
+	.oldest/bin/python -m pytest -n 2 $(ARGS)
 
 DOOR = pk_jax/checks.py,pk_jax/files/*
 coverage: .venv/.ready ## lines and branches reached by the test suite; all of those of input and files
@@ -81,6 +86,6 @@ lock: .venv/.ready ## regenerate requirements/*.lock (UPGRADE=1: with newer vers
 	$(COMPILE) requirements/mutants.in -o requirements/mutants.lock
 
 clean: ## remove .venv, caches and build products (never runs/)
-	rm -rf .venv .mutants build dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .mutants .oldest build dist .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 	find . -name .ipynb_checkpoints -type d -prune -exec rm -rf {} +

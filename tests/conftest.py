@@ -53,15 +53,34 @@ def programs_do_not_pile_up():
         gc.collect()
 
 
+HASTE = "jax_disable_most_optimizations"
+
+
+def pytest_configure(config):
+    """Most tests compile. Without most optimizations XLA is sooner done, and computes the same to roundoff."""
+    jax.config.update(HASTE, config.getoption("markexpr") != "soak")
+
+
+def _compiled(in_haste):
+    """No program of the other kind may stay: the next file may compare bits."""
+    before = jax.config.read(HASTE)
+    if before == in_haste:
+        yield
+        return
+    jax.clear_caches()
+    jax.config.update(HASTE, in_haste)
+    yield
+    jax.config.update(HASTE, before)
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="module")
 def compiled_in_haste():
-    """For files that mostly compile: without most optimizations XLA is sooner done, and computes the same.
+    """For files that mostly compile, also in long runs."""
+    yield from _compiled(True)
 
-    To roundoff: no program may stay for the next file, which may compare bits.
-    """
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.clear_caches()
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
-    jax.clear_caches()
+
+@pytest.fixture(scope="module")
+def compiled_well():
+    """For files that mostly run."""
+    yield from _compiled(False)

@@ -339,6 +339,7 @@ def test_home_is_a_mode_of_its_joints(name):
     assert modes.det_sign[0] == (1 if mech.residual(pose, joints).size == pose.size else 0)
 
 
+@pytest.mark.soak
 def test_modes_of_a_five_bar_mirror_each_other_in_the_line_of_its_elbows():
     mech = catalogued("5-link")
     modes = pk.assembly_modes(mech, mech.home()[1] + np.array([0.1, -0.2]))

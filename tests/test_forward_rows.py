@@ -125,6 +125,7 @@ def test_a_batch_equals_a_loop(found):
         assert_equal_rows(alone, take(found, row))
 
 
+@pytest.mark.soak
 def test_a_batch_equals_the_traced_batch(found):
     traced = jax.jit(lambda q: pk.forward_kinematics(SEMI, q))(JOINTS[:4096])
     assert_equal_rows(traced, take(found, slice(4096)))

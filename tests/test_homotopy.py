@@ -31,6 +31,7 @@ def test_the_product_is_hamiltons():
         assert np.array_equal(times(a, b), c)
 
 
+@pytest.mark.soak
 def test_a_leg_is_the_residual_as_a_quadratic_form():
     random = np.random.default_rng(0)
     base, platform = random.normal(size=(2, 6, 3))

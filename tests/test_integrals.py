@@ -229,6 +229,7 @@ def test_area_of_the_two_rpr():
     assert value.mean.shape == (0,) and found.mean.shape == (0, 2)
 
 
+@pytest.mark.soak
 def test_area_goes_with_the_square_of_the_lengths():
     small, large = of_two_rpr(1.0, 2.08), of_two_rpr(2.0, 4.16)
     np.testing.assert_allclose(large.value.volume, 4 * small.value.volume, rtol=1e-8)

@@ -179,6 +179,7 @@ class Faulty(Slide):
         return jnp.stack([first, second]), jnp.array([True, True])
 
 
+@pytest.mark.soak
 @IN_HASTE
 def test_the_slide_itself_is_sound():
     assert pk.check_mechanism(Slide(gap=0.25))

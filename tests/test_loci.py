@@ -203,6 +203,7 @@ def test_type_one_of_the_five_bar_are_its_circles(name, leg, sign):
     assert farthest(reached, points, box(found)) <= STEP
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("name", FIVE)
 def test_default_ranges_contain_all_that_the_five_bar_reaches(name):
     """It reaches farthest to the sides with one leg stretched, and up with both."""
@@ -348,6 +349,7 @@ def test_similar_triangles_are_singular_on_a_circle():
     np.testing.assert_allclose(length_of(found), 2 * np.pi * similar_radius(0.9), rtol=0.02)  # and once
 
 
+@pytest.mark.soak
 def test_similar_triangles_unturned_are_singular_everywhere():
     found = pk.singularity_locus(SIMILAR, at=[0, 0, 0], nodes=41, kinds="II")
     assert [kind for kind, _ in found.everywhere] == [TWO] and not found.curves

@@ -144,6 +144,7 @@ def test_a_file_in_millimetres(run, here):
     np.testing.assert_allclose(found["radius_mm"], 1e3 * in_m.radius, rtol=1e-12)
 
 
+@pytest.mark.soak
 def test_ways_from_home_are_told(run, monkeypatch):
     """Home is a mode of its own joints: the way to it is found; its image has the other sign."""
     out = run("modes", "5-link", "--connect", "-o", "m.csv")[1]

@@ -515,6 +515,7 @@ def differentiated(rows):
 LOST = [5, 6]
 
 
+@pytest.mark.soak
 def test_traced_rows_are_the_known_rows(rows, differentiated):
     lengths, weights, _, found = differentiated
     known = pk.nine_length_pose(rows[0], lengths, weights)

@@ -104,6 +104,7 @@ def test_laws_hold(build):
     assert len(pk.check_mechanism(build())) >= 19
 
 
+@pytest.mark.soak
 def test_one_length_for_all_arms_is_one_each():
     each = pk.PlanarRRR(
         base=equal_arms().base, platform=equal_arms().platform, proximal=[0.36] * 3, distal=[0.31] * 3
@@ -532,6 +533,7 @@ def six_link_closure(mech, joints, pose):
     return (placed(pose, np.asarray(mech.platform)) - tips).ravel()
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize(
     ("build", "closure"),
     [(lambda: catalogued("4-rrr"), rrr_closure), (six_link, six_link_closure)],

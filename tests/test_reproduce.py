@@ -20,6 +20,8 @@ from pk_jax.cli import main
 from pk_jax.design.optimize import maximize
 from pk_jax.papers.nam2006_printed import MISPRINTS, TABLES
 
+pytestmark = pytest.mark.usefixtures("compiled_well")
+
 README = (Path(__file__).parent.parent / "README.md").read_text()
 RPR, RRR = pk.design_space("2-rpr"), pk.design_space("2-rrr")
 

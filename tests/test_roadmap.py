@@ -227,6 +227,7 @@ def test_it_finds_the_same_again(stewart):
     jax.tree.map(np.testing.assert_array_equal, found, again)
 
 
+@pytest.mark.soak
 def test_limits_close_ways(stewart):
     joints, modes, free = stewart
     ends = np.stack([joints, np.asarray(STEWART.home()[1])])

@@ -266,10 +266,11 @@ def test_screws_of_a_delta_are_its_rods():
     mech = outsiders.delta()
     pose, joints, a, b = at_home(mech)
     found = pk.screws(mech, pose, joints)
-    rods = np.asarray(pose + mech.ring(mech.platform_radius) - mech.elbows(joints)) / 0.8
+    shoulders, elbows, ends = np.asarray(jnp.stack(mech.rings(pose, joints))).swapaxes(1, 2)
+    rods = (ends - elbows) / 0.8
     close(found.lines, rods)
     close(lift(found, b), -np.linalg.solve(b, a))
-    radial, down = np.asarray(mech.ring(1.0)), np.array([0, 0, -1.0])  # an arm turns its elbow at arm * down
+    radial, down = shoulders / 0.2, np.array([0, 0, -1.0])  # an arm turns its elbow at arm * down
     close(found.arms, 0.35 * rods @ down)
     assert np.max(np.abs(np.sum(radial * found.lines, axis=1))) > 0.1
 

@@ -101,6 +101,7 @@ def test_a_path_of_fewer_rows_is_the_beginning_of_it(followed):
     assert int(short.reached) == 17
 
 
+@pytest.mark.soak
 def test_a_path_of_one_row():
     found = pk.track(SEMI, PATH[:1].tolist())
     assert found.pose.rotation.shape == (1, 3, 3) and int(found.reached) == 1
@@ -116,6 +117,7 @@ def test_a_path_from_a_given_start(followed):
     assert_same_pose(found.pose, jax.tree.map(lambda leaf: np.roll(leaf, -20, axis=0), CIRCLE), 1e-12)
 
 
+@pytest.mark.soak
 def test_a_start_printed_with_six_digits_gives_the_poses_themselves():
     start = take(CIRCLE, 0)
     found = pk.track(SEMI, PATH, pk.SE3(start.translation, np.round(start.rotation, 6)))

@@ -199,6 +199,7 @@ def test_scales_with_the_base():
 # --- derivatives
 
 
+@pytest.mark.soak
 def test_gradients_against_central_differences():
     rng = np.random.default_rng(7)
     l_min = rng.uniform(1.1, 4.9, 32)
@@ -347,6 +348,7 @@ def test_unknown_rule_and_mechanism():
         pk.workspace_indices("2-rpr")
 
 
+@pytest.mark.soak
 def test_single_precision():
     """Gauss and paper keep six digits; eq. (29) would be wrong without a word, and is refused."""
     code = (

@@ -164,6 +164,7 @@ def test_a_map_is_a_plain_loop(name):
     assert found.is_inside.dtype == bool and 0 < np.mean(found.is_inside) < 1
 
 
+@pytest.mark.soak
 def test_units_and_the_pose_that_has_the_other_coordinates_come_along():
     assert mapped("casing").units == (0, 0) and mapped("casing, carriage").units == (0, 1)
     assert mapped("stewart").units == (1, 0) and mapped("2-rpr").units == (1, 1)
@@ -512,6 +513,7 @@ def test_derivatives_of_the_best_carriage_are_those_of_differences():
         assert np.max(np.abs(got[0, :4])) > 0.01 and np.max(np.abs(got[0, 6:])) > 0.1
 
 
+@pytest.mark.soak
 def test_where_many_carriages_are_best_derivatives_are_those_of_differences():
     """Leg 2 has the least margin and does not see the carriage: the first of the best is taken."""
     pose = casing_at(["s", "roll", "yaw"], [0.42, 0.01, 0.02])

@@ -21,9 +21,8 @@ from pk_jax.geometry import safe
 from pk_jax.geometry.matrices import small_det, small_inverse
 from pk_jax.geometry.poses import pose_units
 from pk_jax.kinematics.blocks import has_one_joint_an_equation, joint_blocks
-from pk_jax.kinematics.jacobian import joint_jacobian, pose_jacobian
+from pk_jax.kinematics.jacobian import joint_jacobian, pose_jacobian, units
 from pk_jax.mechanisms.base import Mechanism
-from pk_jax.mechanisms.regular import units
 
 Measure = Callable[[Mechanism, Any, jax.Array], jax.Array]  # of one configuration -> ()
 

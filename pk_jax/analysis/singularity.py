@@ -25,11 +25,10 @@ from pk_jax.kinematics.batching import all_finite, configurations, is_possible, 
 from pk_jax.kinematics.closure import INCONSISTENT_ABOVE, joint_scale, pose_scale
 from pk_jax.kinematics.entrywise import entrywise
 from pk_jax.kinematics.jacobi import lengths, orthogonal_rows
-from pk_jax.kinematics.jacobian import SINGULAR_BELOW, joint_jacobian, pose_jacobian
+from pk_jax.kinematics.jacobian import SINGULAR_BELOW, joint_jacobian, pose_jacobian, units
 from pk_jax.kinematics.lane_map import lane_map
 from pk_jax.kinematics.lanes import Entries, Lane, items_of
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
-from pk_jax.mechanisms.regular import units
 from pk_jax.status import Status
 
 

@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from pk_jax.geometry.poses import pose_units, position
-from pk_jax.kinematics.jacobian import joint_jacobian
+from pk_jax.kinematics.jacobian import joint_jacobian, units
 from pk_jax.mechanisms.base import Mechanism
-from pk_jax.mechanisms.regular import units
 
 ROUNDOFFS = 256  # the residual of an exact configuration may be this many roundings of its terms
 INCONSISTENT_ABOVE = 1e-6  # of the size of each closure equation, for redundant mechanisms

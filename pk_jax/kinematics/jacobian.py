@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial, wraps
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from pk_jax.geometry.poses import Turned
+from pk_jax.geometry.poses import Turned, pose_units
 from pk_jax.kinematics.batching import configurations, over_rows
 from pk_jax.mechanisms.base import Mechanism, require_mechanism
-from pk_jax.mechanisms.regular import ScaledJacobians, without_units
 
 SINGULAR_BELOW = 1e-6  # sine of an angle; a reach limit itself is only known to sqrt(eps)
 
@@ -75,10 +74,26 @@ def self_motions(mech: Mechanism, pose: Any, joints: jax.Array) -> jax.Array:
     return jnp.concatenate([rates.T, jnp.eye(mech.free_joints, dtype=rates.dtype)], axis=1)
 
 
+class ScaledJacobians(NamedTuple):
+    """A and B without units: lengths over length(), rows of A of unit norm."""
+
+    pose: jax.Array  # (c, n)
+    joints: jax.Array  # (c, m)
+
+
 def scaled_jacobians(mech: Mechanism, pose: Any, joints: jax.Array) -> ScaledJacobians:
     """A and B with lengths measured in `mech.length()` and each equation scaled to |A row| = 1.
 
     A condition number, a rank or a distance to a singularity is only ever taken of these.
     """
     a, b = pose_jacobian(mech, pose, joints), joint_jacobian(mech, pose, joints)
-    return without_units(mech, pose, a, b)
+    a = a * mech.length() ** units(pose_units(pose, mech.pose_units), a.dtype)
+    b = b * mech.length() ** units(mech.joint_units or (1,) * b.shape[1], b.dtype)
+    size = jnp.linalg.norm(a, axis=1, keepdims=True)
+    size = jnp.where(size > 0, size, 1)
+    return ScaledJacobians(a / size, b / size)
+
+
+def units(powers: tuple[int, ...], dtype: Any) -> jax.Array:
+    """Powers of length of the coordinates: 1 = length, 0 = angle."""
+    return jnp.asarray(powers, dtype)

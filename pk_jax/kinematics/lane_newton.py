@@ -20,10 +20,9 @@ from pk_jax.kinematics import elimination
 from pk_jax.kinematics.closure import closure, pose_scale
 from pk_jax.kinematics.elimination import Matrix, Order, Reference
 from pk_jax.kinematics.entrywise import Invariants, entrywise
-from pk_jax.kinematics.jacobian import SINGULAR_BELOW, scaled_jacobians
+from pk_jax.kinematics.jacobian import SINGULAR_BELOW, scaled_jacobians, units
 from pk_jax.kinematics.lanes import Entries, Lane, is_entries, items_of, over, rebuilt, times, total
 from pk_jax.mechanisms.base import LegMechanism, Mechanism
-from pk_jax.mechanisms.regular import units
 from pk_jax.status import Status
 
 STEPS = 10

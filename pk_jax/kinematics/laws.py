@@ -79,16 +79,6 @@ def _check_contract(mech: Mechanism, name: str) -> None:
             raise ValueError(
                 f"{name}.{attribute} must be {count} numbers, 1 = length and 0 = angle, got {units}"
             )
-    if m - mech.free_joints < n:
-        raise ValueError(
-            f"{name} has {m - mech.free_joints} joints for a pose of {n} coordinates: let the pose have the "
-            "platform's own freedoms and no constraint (as in examples/three_rps.py)"
-        )
-    if (which := _not_round(mech, pose, joints)) is not None:
-        raise ValueError(
-            f"{name} closes no more after a full turn of coordinate {which + 1} of its pose: say "
-            "angles_come_round = False"
-        )
     if m - mech.free_joints > c:
         raise ValueError(
             f"{name} has {m} joints in {c} closure equations: the last {m - c} must be its free_joints"
@@ -100,6 +90,16 @@ def _check_contract(mech: Mechanism, name: str) -> None:
         )
     if mech.free_joints and (shape := mech.free_range().shape) != (mech.free_joints, 2):
         raise ValueError(f"{name}.free_range must have shape {(mech.free_joints, 2)}, got {shape}")
+    if m - mech.free_joints < n:
+        raise ValueError(
+            f"{name} has {m - mech.free_joints} joints for a pose of {n} coordinates: let the pose have the "
+            "platform's own freedoms and no constraint (as in examples/three_rps.py)"
+        )
+    if (which := _not_round(mech, pose, joints)) is not None:
+        raise ValueError(
+            f"{name} closes no more after a full turn of coordinate {which + 1} of its pose: say "
+            "angles_come_round = False"
+        )
     f, a = jax.eval_shape(mech.linearize, pose, joints)  # shapes alone: op by op it would be slow
     if f.shape != (c,) or a.shape != (c, n):
         raise ValueError(

@@ -29,9 +29,9 @@ from pk_jax.kinematics.jacobian import (
     pose_jacobian,
     scaled_jacobians,
     self_motions,
+    units,
 )
 from pk_jax.mechanisms.base import LegMechanism, Mechanism, require_mechanism
-from pk_jax.mechanisms.regular import units
 from pk_jax.status import Status
 
 A_COUPLE = 1e-9  # force over moment / length() below which a wrench is a pure couple

@@ -12,7 +12,6 @@ from pk_jax.geometry import safe
 from pk_jax.geometry.axis_pose import AxisPose
 from pk_jax.geometry.poses import place
 from pk_jax.mechanisms.base import LegMechanism, Skeleton
-from pk_jax.mechanisms.regular import require_regular_home
 
 LEGS = 4
 
@@ -85,7 +84,6 @@ class CasingOscillator(LegMechanism):
                 "CasingOscillator.neutral must lie inside the stroke, got joints "
                 f"{', '.join(f'{name} = {q:.6g}' for name, q in zip(self.joint_names, joints, strict=True))}"
             )
-        require_regular_home(self)
 
     def attachments(self) -> jax.Array:
         r, zero = self.platform_radius, jnp.zeros_like(self.platform_radius)

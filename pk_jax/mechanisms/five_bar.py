@@ -10,7 +10,6 @@ from pk_jax import checks
 from pk_jax.geometry import safe
 from pk_jax.geometry.planar import arm_angles, cross, direction, quarter_turn
 from pk_jax.mechanisms.base import LegMechanism, Skeleton
-from pk_jax.mechanisms.regular import require_regular_home
 
 ELBOWS_OUT = (1.0, -1.0)  # eq. (6): "+" for leg 1, "-" for leg 2
 
@@ -78,7 +77,6 @@ class FiveBar(LegMechanism):
                 "FiveBar.slack must be sqrt(proximal / half_base - 1) or left out, "
                 f"got {self.slack:.6g} with proximal / half_base = {self.proximal / self.half_base:.6g}"
             )
-        require_regular_home(self)
 
     def default_branch(self) -> jax.Array:
         return jnp.asarray(ELBOWS_OUT, self.half_base.dtype)

@@ -13,7 +13,6 @@ from pk_jax.geometry.circles import platforms_on_circles
 from pk_jax.geometry.poses import place
 from pk_jax.mechanisms import planar_platform
 from pk_jax.mechanisms.base import Skeleton
-from pk_jax.mechanisms.regular import require_regular_home
 
 
 class PlanarRPR(planar_platform.PlanarPlatform):
@@ -49,7 +48,6 @@ class PlanarRPR(planar_platform.PlanarPlatform):
                     f"PlanarRPR.stroke must be 0 < least < greatest, got {np.asarray(self.stroke).tolist()}"
                 )
         planar_platform.check_home("PlanarRPR", _best_home(self)[1], "stroke")
-        require_regular_home(self)
 
     def limits(self) -> tuple[jax.Array, jax.Array]:
         """Least and greatest length of each leg; without a stroke, where a home is sought. -> (k,), (k,)"""

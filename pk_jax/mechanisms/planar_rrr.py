@@ -12,7 +12,6 @@ from pk_jax.geometry.planar import arm_angles, cross, direction
 from pk_jax.geometry.poses import place
 from pk_jax.mechanisms import planar_platform
 from pk_jax.mechanisms.base import Skeleton
-from pk_jax.mechanisms.regular import require_regular_home
 
 
 class PlanarRRR(planar_platform.ArmedPlatform):
@@ -44,7 +43,6 @@ class PlanarRRR(planar_platform.ArmedPlatform):
         planar_platform.check_positive("PlanarRRR", self.links())
         planar_platform.check_ends("PlanarRRR", self.base, self.platform)
         planar_platform.check_home("PlanarRRR", _best_home(self)[1], "proximal and distal")
-        require_regular_home(self)
 
     def default_branch(self) -> jax.Array:
         return jnp.ones(self.base.shape[0], self.base.dtype)

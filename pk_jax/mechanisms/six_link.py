@@ -12,7 +12,6 @@ from pk_jax.geometry.planar import arm_angles, cross, direction, quarter_turn
 from pk_jax.geometry.poses import place
 from pk_jax.mechanisms import planar_platform
 from pk_jax.mechanisms.base import Skeleton
-from pk_jax.mechanisms.regular import require_regular_home
 
 ELBOWS_OUT = (-1.0, 1.0)  # with the first arm on the left
 
@@ -43,7 +42,6 @@ class SixLink(planar_platform.ArmedPlatform):
         planar_platform.check_positive("SixLink", self.links())
         planar_platform.check_ends("SixLink", self.base, self.platform)
         planar_platform.check_home("SixLink", _best_home(self)[1], "proximal and distal")
-        require_regular_home(self)
 
     def default_branch(self) -> jax.Array:
         return jnp.asarray(ELBOWS_OUT, self.base.dtype)

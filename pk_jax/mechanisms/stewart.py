@@ -15,7 +15,6 @@ from pk_jax.geometry.matrices import least_direction, small_inverse
 from pk_jax.geometry.poses import place
 from pk_jax.geometry.se3 import SE3
 from pk_jax.mechanisms.base import LegMechanism, Skeleton
-from pk_jax.mechanisms.regular import require_regular_home
 
 LEGS = 6
 SINGULAR_BELOW = 1e-6  # least singular value, without units, below which a platform is of no use
@@ -113,7 +112,6 @@ class Stewart(LegMechanism):
                 "Stewart.base and platform are architecturally singular: the six legs are dependent in every "
                 "pose (affine copies of one hexagon, for example), got a least singular value below 1e-6"
             )
-        require_regular_home(self)
 
     def attachments(self) -> jax.Array:
         return self.platform

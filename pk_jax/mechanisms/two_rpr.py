@@ -9,7 +9,6 @@ from jax import lax
 from pk_jax import checks
 from pk_jax.geometry import safe
 from pk_jax.mechanisms.base import LegMechanism, Skeleton
-from pk_jax.mechanisms.regular import require_regular_home
 
 
 class TwoRPR(LegMechanism):
@@ -41,7 +40,6 @@ class TwoRPR(LegMechanism):
                 f"TwoRPR.l_max must exceed half_base = {self.half_base:.6g} (the legs must meet), "
                 f"got {self.l_max:.6g}"
             )
-        require_regular_home(self)
 
     def base(self) -> jax.Array:
         """Where the legs stand. -> (2, 2)"""

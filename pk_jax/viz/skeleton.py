@@ -19,10 +19,12 @@ def draw(mech: Mechanism, pose: Any, joints: jax.Array, ax: Axes | None = None, 
     Lengths in the mechanism's unit, equal on all axes. A skeleton in space needs 3-D axes, which
     are made where `ax` is left out. `line` goes to `Axes.plot` (color, linewidth, alpha, ...).
     """
-    require_mechanism("draw", mech)
-    (pose, joints), are_batched = configurations(mech, pose, joints)
-    if any(are_batched):
-        raise ValueError("draw takes one configuration, got a batch")
+    if isinstance(mech, Mechanism):
+        (pose, joints), are_batched = configurations(mech, pose, joints)
+        if any(are_batched):
+            raise ValueError("draw takes one configuration, got a batch")
+    elif not hasattr(mech, "skeleton"):  # anything that has one can be drawn
+        require_mechanism("draw", mech)
     skeleton = mech.skeleton(pose, joints)
     points = np.asarray(skeleton.points)
     is_spatial = points.shape[-1] == 3

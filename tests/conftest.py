@@ -57,7 +57,7 @@ HASTE = "jax_disable_most_optimizations"
 
 
 def pytest_configure(config):
-    """Most tests compile. Without most optimizations XLA is sooner done, and computes the same to roundoff."""
+    """Most tests compile; without most optimizations XLA is sooner done. It computes the same to roundoff."""
     jax.config.update(HASTE, config.getoption("markexpr") != "soak")
 
 

@@ -118,9 +118,8 @@ def noise_of(seed, samples):
 # ---------------------------------------------------------------- what the sensors are worth
 
 
-@pytest.mark.parametrize(
-    "feedbacks", [("joint", "nine", "learned"), pytest.param(FEEDBACKS, marks=pytest.mark.soak)]
-)
+@pytest.mark.soak
+@pytest.mark.parametrize("feedbacks", [FEEDBACKS])
 def test_every_feedback_makes_an_ideal_platform_follow_the_late_circle(feedbacks):
     found = [run(feedback, "circle", SLOW) for feedback in feedbacks]
     assert all(np.all(runs.status == Status.OK) for runs in found)

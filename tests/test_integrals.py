@@ -219,6 +219,7 @@ def of_two_rpr(half_base, l_min, index=()):
     return integral_gradient(two_rpr, [half_base, l_min], index, rays=64, nodes=12)
 
 
+@pytest.mark.soak
 def test_area_of_the_two_rpr():
     """The five-bar's, too: both reach the poses between the same limits."""
     found = of_two_rpr(1.0, 2.08)

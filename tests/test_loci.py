@@ -214,6 +214,7 @@ def test_default_ranges_contain_all_that_the_five_bar_reaches(name):
         assert line[0] <= -far and line[-1] >= far
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("name", FIVE)
 def test_type_two_of_the_five_bar_are_parallel_distal_links(name):
     """sin(alpha2 - alpha1) = 0: the elbows coincide, or are two distal links apart. Elbows from circles."""

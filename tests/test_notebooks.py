@@ -15,15 +15,7 @@ SCRIPTS = sorted((ROOT / "notebooks").glob("*.py"))
 LARGEST = 1_500_000  # bytes of an .ipynb
 CELL = re.compile(r"^# %%(?P<markdown> \[markdown\])?$", re.MULTILINE)
 
-# all others, up to a minute each, are run by `make soak`, and whenever they are executed anew
-ALWAYS = ("08_your_own_mechanism",)
-
 EVERY = pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
-IN_TURN = pytest.mark.parametrize(
-    "script",
-    [path if path.stem in ALWAYS else pytest.param(path, marks=pytest.mark.soak) for path in SCRIPTS],
-    ids=lambda path: path.stem,
-)
 
 
 def cells_of(text):
@@ -60,7 +52,8 @@ def test_there_are_notebooks():
     assert {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")} == {path.stem for path in SCRIPTS}
 
 
-@IN_TURN
+@pytest.mark.soak  # a minute each
+@EVERY
 def test_it_runs_as_a_script_without_warnings(script, tmp_path):
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     settings = {"JAX_PLATFORMS": "cpu", "MPLBACKEND": "Agg", "PYTHONPATH": os.pathsep.join(paths)}

@@ -125,6 +125,7 @@ def test_a_start_printed_with_six_digits_gives_the_poses_themselves():
     assert_same_pose(found.pose, CIRCLE, 1e-9)
 
 
+@pytest.mark.soak
 def test_the_other_branch_is_followed_from_a_start_on_it():
     ramp = yaws(np.linspace(125, 110, 32))
     assert side(take(ramp, 0)) == -1

@@ -229,6 +229,7 @@ def test_gradients_beside_a_degenerate_curve():
         assert np.max(np.abs(slopes()(designs)[:, :, j] - (4 * first - second) / 3)) < 2e-6
 
 
+@pytest.mark.soak
 def test_gradients_are_finite_everywhere():
     assert np.all(np.isfinite(slopes()(scan())))
 

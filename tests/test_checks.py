@@ -243,3 +243,23 @@ def test_words_are_a_string_or_a_sequence():
 def test_what_is_no_mechanism_is_told(function):
     with pytest.raises(ValueError, match=rf"^{function.__name__} takes a pk_jax\.Mechanism, got int$"):
         function(3, [0.3, 2.2])
+
+
+def test_devices_are_a_list_and_the_first_one_unless_given():
+    first = jax.local_devices()[:1]
+    assert checks.are_devices("devices", None) == first == checks.are_devices("devices", tuple(first))
+    for bad in ("cpu", [0], first[0], [*first, None]):
+        with pytest.raises(ValueError, match=r"^devices must be a list of jax\.devices\(\), got "):
+            checks.are_devices("devices", bad)
+    with pytest.raises(ValueError, match=r"^devices must hold at least one$"):
+        checks.are_devices("devices", [])
+
+
+def test_numbers_keep_their_precision_and_long_ones_become_float64():
+    double = np.ones(3)
+    assert checks.real_numpy("x", double) is double  # not even copied
+    assert checks.real_numpy("x", np.ones(3, np.longdouble)).dtype == np.float64
+    kept = jax.eval_shape(lambda x: checks.real_array("x", x), jax.ShapeDtypeStruct((3,), np.int32))
+    assert kept.dtype == jnp.result_type(float)
+    with pytest.raises(ValueError, match=r"^x must be real numbers, got complex"):
+        jax.eval_shape(lambda x: checks.real_array("x", x), jax.ShapeDtypeStruct((3,), np.complex64))

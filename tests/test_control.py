@@ -119,9 +119,8 @@ def noise_of(seed, samples):
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("feedbacks", [FEEDBACKS])
-def test_every_feedback_makes_an_ideal_platform_follow_the_late_circle(feedbacks):
-    found = [run(feedback, "circle", SLOW) for feedback in feedbacks]
+def test_every_feedback_makes_an_ideal_platform_follow_the_late_circle():
+    found = [run(feedback, "circle", SLOW) for feedback in FEEDBACKS]
     assert all(np.all(runs.status == Status.OK) for runs in found)
     errors = [rms(runs) for runs in found]
     assert max(errors) < 1.05 * min(errors) and max(errors) < 50 * MICROMETRE

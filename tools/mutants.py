@@ -28,7 +28,8 @@ import tomllib
 from pathlib import Path
 
 from cosmic_ray.commands.init import init
-from cosmic_ray.mutating import mutate_and_test
+from cosmic_ray.mutating import mutate_and_test, mutate_code
+from cosmic_ray.plugins import get_operator
 from cosmic_ray.testing import run_tests
 from cosmic_ray.work_db import WorkDB
 from cosmic_ray.work_item import MutationSpec, TestOutcome
@@ -52,15 +53,32 @@ def mutants_of(modules: list[str]) -> list[MutationSpec]:
 
 
 def sample(mutants: list[MutationSpec], count: int, seed: int) -> list[MutationSpec]:
-    """One mutant at each of so many places, the same for the same code and seed."""
+    """One mutant at each of so many places, the same for the same code and seed; none that is no Python."""
     at = {}
     for each in mutants:
         at.setdefault((str(each.module_path), each.start_pos), []).append(each)
     chance = random.Random(seed)
-    places = chance.sample(sorted(at), min(count, len(at)))
-    return [
-        chance.choice(sorted(at[place], key=lambda m: (m.operator_name, m.occurrence))) for place in places
-    ]
+    places, chosen = sorted(at), []
+    chance.shuffle(places)
+    for place in places:
+        ones = sorted(at[place], key=lambda mutant: (mutant.operator_name, mutant.occurrence))
+        chance.shuffle(ones)
+        chosen += [one for one in ones if is_python(one)][:1]
+        if len(chosen) == count:
+            break
+    return chosen
+
+
+def is_python(mutant: MutationSpec) -> bool:
+    """A star of a signature that became a minus kills every test: that does not count."""
+    operator = get_operator(mutant.operator_name)(**mutant.operator_args)
+    try:
+        compile(
+            mutate_code(Path(mutant.module_path).read_text(), operator, mutant.occurrence), "mutant", "exec"
+        )
+    except SyntaxError:
+        return False
+    return True
 
 
 def command_for(tests: str) -> str:

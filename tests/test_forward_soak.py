@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 import pytest
+import test_forward_rows as stewart
 from outsiders import delta, three_legs, three_rpr
 from scipy.spatial.transform import Rotation
 
@@ -423,3 +424,13 @@ def test_redundant_joints_that_disagree(name):
         counts += statuses(found)
     told(name, "disagreeing", counts)
     assert counts["OK"] <= counts.total() / 100 and counts["INCONSISTENT"] > counts.total() / 4
+
+
+@pytest.mark.soak
+def test_every_pose_about_home_of_a_semi_regular_platform_comes_back_as_itself():
+    """Unless it is beyond a singularity; then it does not."""
+    mech = pk.catalogued("semi-regular-stewart")
+    for seed in range(-(-MANY // BLOCK)):
+        poses = stewart.some_poses(mech, min(MANY, BLOCK), seed=seed)
+        found = pk.forward_kinematics(mech, stewart.lengths(mech, poses)).pose
+        np.testing.assert_array_equal(apart(found, poses) <= 1e-6, stewart.sides(mech, poses) > 0)

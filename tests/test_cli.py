@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from pk_jax.cli import main
+from pk_jax.files.mechanism_file import FAMILIES
 from pk_jax.mechanisms.catalogue import CATALOGUE
 
 
@@ -75,8 +76,11 @@ def test_optimize_that_ran_out_of_steps(capsys):
 
 def test_list(capsys):
     code, out, _ = run(capsys, "list")
-    assert code == 0 and [line.split()[0] for line in out.splitlines()] == list(CATALOGUE)
-    assert all(entry.source in line for entry, line in zip(CATALOGUE.values(), out.splitlines(), strict=True))
+    entries, families = (part.splitlines() for part in out.split("\n\n"))
+    assert code == 0 and [line.split()[0] for line in entries] == list(CATALOGUE)
+    assert all(entry.source in line for entry, line in zip(CATALOGUE.values(), entries, strict=True))
+    assert [line.split()[0] for line in families[1:]] == list(FAMILIES)
+    assert "half_base, proximal, distal, [reach]" in families[1 + list(FAMILIES).index("FiveBar")]
 
 
 BAD = {

@@ -77,13 +77,18 @@ def _draw(options: argparse.Namespace) -> int:
 
 
 def add_list(command: Command) -> None:
-    command("list", _list, "the catalogue of published designs")
+    command("list", _list, "the catalogue of published designs, and the families of a mechanism file")
 
 
 def _list(options: argparse.Namespace) -> int:
+    from pk_jax.files.mechanism_file import FAMILIES, keys_of
     from pk_jax.mechanisms.catalogue import CATALOGUE
 
     width = max(map(len, CATALOGUE)) + 2
     for name, entry in CATALOGUE.items():
         print(f"{name:{width}}{entry.source}")
+    print("\nfamilies of a mechanism file: their keys beside family and unit; [key] may be left out")
+    for name, family in FAMILIES.items():
+        keys = (key if needed else f"[{key}]" for key, needed in keys_of(family).items())
+        print(f"{name:{width}}{', '.join(keys)}")
     return 0

@@ -121,7 +121,7 @@ def _parse(content: bytes) -> MechanismFile:
     classes = list(FAMILIES.values())
     if "family" in table:
         classes = [FAMILIES[choice("family", table["family"], FAMILIES)]]
-    fields = {name: is_needed for cls in classes for name, is_needed in _fields(cls).items()}
+    fields = {name: is_needed for cls in classes for name, is_needed in keys_of(cls).items()}
     known = ("family", "unit", *COMMENTS, *fields)
     for key in table:
         if key not in known:
@@ -147,7 +147,7 @@ def _parse(content: bytes) -> MechanismFile:
     return MechanismFile(mechanism, unit, float(UNITS[unit]))
 
 
-def _fields(cls: type[Mechanism]) -> dict[str, bool]:
+def keys_of(cls: type[Mechanism]) -> dict[str, bool]:
     """The fields of a family that a file may give, and whether it must."""
     fields = dataclasses.fields(cls)
     return {f.name: f.default is dataclasses.MISSING for f in fields if f.name not in NOT_IN_FILES}
@@ -206,7 +206,7 @@ def _compose(mech: Mechanism, unit: str) -> str:
             f"only a mechanism of the house with known values can be saved, got a traced {family}"
         )
     lines = [f'family = "{family}"', f'unit = "{unit}"']
-    for key in _fields(type(mech)):
+    for key in keys_of(type(mech)):
         if (value := getattr(mech, key)) is not None:
             array = np.asarray(checks.real_array(f"{family}.{key}", value))
             checks.is_finite(f"{family}.{key}", array)

@@ -115,6 +115,19 @@ def is_count(name: str, value: Any, *, least: int = 1, most: int | None = None) 
     return int(value)
 
 
+def is_flag(name: str, value: Any) -> bool:
+    """`value`, True or False; 1 and "no" are neither."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, got {shown(value)}")
+    return bool(value)
+
+
+def is_function(name: str, value: Any) -> None:
+    """That `value` can be called, or is None."""
+    if not (value is None or callable(value)):
+        raise ValueError(f"{name} must be a function or None, got {shown(value)}")
+
+
 def is_dict(name: str, value: Any) -> Mapping:
     if not isinstance(value, Mapping):
         raise ValueError(f"{name} must be a dict, name -> (lower, upper), got {shown(value)}")

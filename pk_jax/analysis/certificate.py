@@ -73,7 +73,7 @@ def certify_regular(
     singularity, or `most` was too small. ValueError for mechanisms that `enclosure` has no
     rules for, or whose A depends on joints that are not free.
     """
-    _check("certify_regular", mech, at_least)
+    _check("certify_regular", mech, at_least, report)
     box = Box(mech, ranges)
     if box.equations != box.n:
         raise ValueError(
@@ -83,8 +83,7 @@ def certify_regular(
     if not np.all(np.isfinite(at)):
         raise ValueError(f"no certificate for {type(mech).__name__}: A depends on joints that are not free")
     at_home, at_centre = np.linalg.det(at)
-    if scale is not None and not callable(scale):
-        raise ValueError(f"scale must be a function of the coordinates, got {checks.shown(scale)}")
+    checks.is_function("scale", scale)
     scale = abs(at_home) if scale is None else scale
     within = checks.are_words("within", within) and _margins_named(mech, within)
     settle = partial(_regular, box, scale, within, at_least, np.sign(at_centre))
@@ -115,7 +114,7 @@ def certify_confined(
     ValueError where home is not inside the box and the margins, or the angles are not those of one chart:
     |pitch| < pi/2, |roll|, |yaw|, |phi| < pi.
     """
-    _check("certify_confined", mech, at_least)
+    _check("certify_confined", mech, at_least, report)
     names = coordinate_names(mech)
     if missing := [name for name in names if name not in checks.is_dict("ranges", ranges)]:
         raise ValueError(f"ranges must have every coordinate of the pose, {', '.join(missing)} missing")
@@ -139,8 +138,9 @@ def certify_confined(
     return bisected(box, settle, faces, most, report, "no way out")
 
 
-def _check(function: str, mech: Any, at_least: Any) -> None:
+def _check(function: str, mech: Any, at_least: Any, report: Any) -> None:
     require_mechanism(function, mech)
+    checks.is_function("report", report)
     if not checks.is_concrete(mech) or mech.length().dtype != jnp.float64:
         raise ValueError("a certificate needs known values in float64: call pk_jax.enable_x64() first")
     if not (checks.is_number(at_least) and at_least >= 0):

@@ -91,6 +91,7 @@ def singularity_locus(
     sign, the points are found too: the search looks for least singular values, not for signs.
     """
     require_mechanism("singularity_locus", mech)
+    checks.is_function("report", report)
     if not checks.is_concrete((mech, at, branch, free, length)):
         raise ValueError("singularity_locus works on known values only; see singularity_distance")
     if mech.length().dtype != jnp.float64:

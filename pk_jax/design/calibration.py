@@ -92,6 +92,7 @@ def calibrate(
             "calibrate takes known values: it chooses rows and unknowns by them, call it outside of jit"
         )
     checks.is_count("steps", steps, most=100_000)
+    offsets = checks.is_flag("offsets", offsets)
     poses, joints = _log(poses, joints, *home_shapes(mech))
     length, joint_units = np.asarray(_length(mech)), mech.joint_units or (1,) * joints.shape[1]
     joint_size = length ** np.array(joint_units, joints.dtype)
@@ -156,6 +157,7 @@ def stewart_from_log(poses: Any, lengths: Any, *, offsets: bool = False) -> Stew
     """
     if not checks.is_concrete((poses, lengths)):
         raise ValueError("stewart_from_log takes known values, call it outside of jit")
+    offsets = checks.is_flag("offsets", offsets)
     lengths = checks.real_array("lengths", lengths)
     checks.has_shape("lengths", lengths, (None, None))
     if lengths.shape[1] < LEGS:

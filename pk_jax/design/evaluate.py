@@ -46,7 +46,7 @@ def evaluate_designs(
         raise ValueError(f"problem must be a DesignProblem, got {type(problem).__name__}")
     vectors = checks.real_numpy("vectors", vectors).astype(jnp.zeros(()).dtype)
     checks.has_shape("vectors", vectors, (None, len(problem.entries)))
-    devices, slopes = checks.are_devices("devices", devices), bool(slopes)
+    devices, slopes = checks.are_devices("devices", devices), checks.is_flag("slopes", slopes)
     if not len(vectors):
         raise ValueError("vectors must hold at least one design")
     answers = problem.objective_count + len(problem.constraint_names)

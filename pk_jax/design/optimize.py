@@ -84,12 +84,10 @@ def optimize_design(
 
     A problem has neither weights nor bounds, and the other defaults of `optimize_problem`.
     """
+    checks.is_function("report", report)
     if isinstance(space, DesignProblem):
         return _optimize_problem(space, weights, bounds, starts, steps, tolerance, report)
-    if not isinstance(space, DesignSpace):
-        raise ValueError(
-            f"space must come from design_space(...) or be a DesignProblem, got {type(space).__name__}"
-        )
+    require_space(space, " or be a DesignProblem")
     starts, steps = 12 if starts is None else starts, 100 if steps is None else steps
     weights = require_weights((1, 1, 1) if weights is None else weights)
     checks.is_count("steps", steps, most=100_000)
@@ -124,6 +122,11 @@ def optimize_design(
     )
 
 
+def require_space(space: Any, others: str = "") -> None:
+    if not isinstance(space, DesignSpace):
+        raise ValueError(f"space must come from design_space(...){others}, got {type(space).__name__}")
+
+
 def _optimize_problem(problem, weights, bounds, starts, steps, tolerance, report) -> OptimizedDesign:
     for name, value in (("weights", weights), ("bounds", bounds)):
         if value is not None:
@@ -134,6 +137,8 @@ def _optimize_problem(problem, weights, bounds, starts, steps, tolerance, report
 
 def index_bounds(space: DesignSpace, *, report: Report | None = None) -> IndexBounds:
     """Least and greatest GII, GRI and SUI over the space, found by the same ascent; cached."""
+    checks.is_function("report", report)
+    require_space(space)
     key = space.name, jnp.zeros(()).dtype.name
     if key not in _bounds:
         signs = jnp.concatenate([-jnp.eye(3), jnp.eye(3)])

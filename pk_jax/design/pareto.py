@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pk_jax import checks
-from pk_jax.design.optimize import Report, index_bounds, indices_and_slopes, maximize
+from pk_jax.design.optimize import Report, index_bounds, indices_and_slopes, maximize, require_space
 from pk_jax.design.problem import DesignProblem
 from pk_jax.design.search import Search, advance, begin, must_fit, start_boxes
 from pk_jax.design.variables import DesignSpace
@@ -73,8 +73,8 @@ def pareto_designs(
 
     Weighted sums find the part of the front that lies on its convex hull.
     """
-    if not isinstance(space, DesignSpace):
-        raise ValueError(f"space must come from design_space(...), got {type(space).__name__}")
+    require_space(space)
+    checks.is_function("report", report)
     weights = _weights(weights, 3)
     bounds = index_bounds(space, report=report)
     lower, ranges = np.asarray(bounds.lower), np.asarray(bounds.upper - bounds.lower)
@@ -113,6 +113,7 @@ def pareto_problem(
     """
     if not isinstance(problem, DesignProblem):
         raise ValueError(f"problem must be a DesignProblem, got {type(problem).__name__}")
+    checks.is_function("report", report)
     weights = _weights(weights, problem.objective_count)
     steps = checks.is_count("steps", steps, most=100_000)
     if reference is not None:

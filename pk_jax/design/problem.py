@@ -42,8 +42,7 @@ class DesignProblem:
         for what, function in (("mechanism", mechanism), ("objective", objective)):
             if not callable(function):
                 raise ValueError(f"{what} must be a function, got {type(function).__name__}")
-        if constraints is not None and not callable(constraints):
-            raise ValueError(f"constraints must be a function or None, got {type(constraints).__name__}")
+        checks.is_function("constraints", constraints)
         if not isinstance(name, str):
             raise ValueError(f"name must be a string, got {checks.shown(name)}")
         self.name = name

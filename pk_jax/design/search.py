@@ -152,6 +152,7 @@ def optimize_problem(
     devices:    see `advance`
     """
     _require_problem(problem)
+    checks.is_function("report", report)
     steps = checks.is_count("steps", steps, most=100_000)
     chunk = checks.is_count("chunk", chunk, most=100_000)
     search = begin(problem, start_boxes(problem, starts, seed=seed), tolerance=tolerance)

@@ -63,6 +63,7 @@ def place_sensors(
     """
     if not isinstance(stewart, Stewart) or stewart.base.shape[0] not in (LEGS, ROWS):
         raise ValueError("place_sensors takes a Stewart with six rows, or nine")
+    checks.is_function("report", report)
     poses, many = rows_of("poses", poses, home_shapes(stewart)[0])
     poses = poses if many else jax.tree.map(lambda leaf: leaf[None], poses)
     for name, value in (("radius", radius), ("platform_radius", platform_radius)):

@@ -86,7 +86,7 @@ def forward_kinematics(
     function theorem; zero on rows that are not OK.
     """
     require_mechanism("forward_kinematics", mech)
-    if certify:
+    if checks.is_flag("certify", certify):
         check_known("forward_kinematics with certify=True", mech, joints, guess)
         found = forward_kinematics(mech, joints, guess)
         proved = prove(mech, found.pose, joints)

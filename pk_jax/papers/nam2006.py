@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pk_jax import checks
 from pk_jax.analysis.workspace import workspace_indices
 from pk_jax.design.objective import IndexBounds, composite_index, index_vector
 from pk_jax.design.optimize import (
@@ -73,6 +74,7 @@ def reproduce(report: Report | None = None) -> Reproduction:
     """Compute everything of the paper that is a number. float64 must be enabled."""
     if jnp.zeros(()).dtype != jnp.float64:
         raise ValueError("reproduce needs float64: call pk_jax.enable_x64() first")
+    checks.is_function("report", report)
     cells, grids, optima = [], {}, {}
     for table in TABLES:
         space = design_space(table.space)

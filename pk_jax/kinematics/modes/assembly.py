@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pk_jax import checks
 from pk_jax.geometry import rotations
 from pk_jax.geometry.poses import Turning, features, like, place, pose_units, tangent_size
 from pk_jax.geometry.se3 import SE3
@@ -104,6 +105,7 @@ def assembly_modes(
     Needs float64 and known values. ValueError for others, and for wrong shapes.
     """
     require_mechanism("assembly_modes", mech)
+    checks.is_function("report", report)
     check_known("assembly_modes", mech, joints)
     joints, is_many = rows_of("joints", joints, home_shapes(mech)[1], numpy=True)
     joints = joints if is_many else joints[None]

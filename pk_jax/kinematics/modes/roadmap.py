@@ -85,6 +85,8 @@ def connect_modes(
 
     Needs float64, known values and a closed form `inverse`. ValueError for others, and for many rows.
     """
+    checks.is_function("report", report)
+    within_limits = checks.is_flag("within_limits", within_limits)
     checks.is_count("nodes", nodes, most=10**9)
     checks.fits(f"nodes = {nodes}", 8 * 3 * (5 * nodes) ** 2, "take fewer")
     joints = _checked(mech, joints, modes)

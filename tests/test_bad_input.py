@@ -149,6 +149,7 @@ PYTHON = [  # number, what is called, how it is refused
     (27, lambda: problem(low=2.0, high=0.5), "variables['proximal'] must have lower < upper"),
     (27, integral(within={"x": (1, 0)}), "within['x'] must be (least, greatest), got (1, 0)"),
     (27, lambda: pk.rectangle([1.0], [0.0], 3), "lower must be at most upper, got [1.0] and [0.0]"),
+    (28, lambda: pk.pareto_designs(pk.design_space("2-rpr"), steps=None), "steps must be an integer from 1"),
     (28, optimized(steps=0), "steps must be an integer from 1 to 100000, got 0"),
     (28, optimized(steps=-3), "steps must be an integer from 1 to 100000, got -3"),
     (28, optimized(steps=1e24), "steps must be an integer from 1 to 100000, got 1e+24"),
@@ -156,6 +157,7 @@ PYTHON = [  # number, what is called, how it is refused
     (29, optimized(tolerance=0.0), "tolerance must be a number between 0 and 1, got 0.0"),
     (29, optimized(tolerance=NAN), "tolerance must be a number between 0 and 1, got nan"),
     (31, lambda: pk.workspace_integral(five(), "isotropi"), "index must be a function or one of frobenius_i"),
+    (31, lambda: pk.integral_gradient(lambda v: five(), [1.0], {}), "index must be a function or one of fro"),
     (31, lambda: pk.workspace_map(five(), "x,q"), "axes must be 2 to 3 different ones of x, y, got ('x', 'q"),
     (31, lambda: pk.catalogued("3-rrrr"), "no catalogue entry '3-rrrr'; there are nam-2-rpr"),
 ]  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -168,7 +169,8 @@ def integral_gradient(mechanism: Any, vector: Any, index: Any = "frobenius_isotr
     if not callable(mechanism):
         raise ValueError(f"mechanism must be a function of a vector, got {type(mechanism).__name__}")
     is_single = not isinstance(index, tuple | list)
-    index = index if is_single else tuple(index)
+    several = names_of(index)
+    index = several[0] if is_single else several
     slopes, found = _replicate_slopes(mechanism, vector, index, _Options(options))
     values = found.replicates
     means = values[:, 1:] / values[:, :1]
@@ -214,11 +216,11 @@ class _Options:
 
 
 def _frozen(leaf: Any) -> Any:
-    """An array by its bytes, anything else as it is."""
+    """An array by its bytes, anything else as it is (what cannot be hashed is refused later)."""
     if isinstance(leaf, jax.Array | np.ndarray):
         array = np.asarray(leaf)
         return array.shape, array.dtype.str, array.tobytes()
-    return type(leaf), leaf
+    return type(leaf), leaf if isinstance(leaf, Hashable) else repr(leaf)
 
 
 @partial(jax.jit, static_argnums=(0, 2, 3))

@@ -84,15 +84,12 @@ def optimize_design(
 
     A problem has neither weights nor bounds, and the other defaults of `optimize_problem`.
     """
-    checks.is_function("report", report)
     if isinstance(space, DesignProblem):
         return _optimize_problem(space, weights, bounds, starts, steps, tolerance, report)
     require_space(space, " or be a DesignProblem")
     starts, steps = 12 if starts is None else starts, 100 if steps is None else steps
     weights = require_weights((1, 1, 1) if weights is None else weights)
-    checks.is_count("steps", steps, most=100_000)
-    _tolerance(tolerance)
-    _start_boxes(space, starts)  # what is wrong is told before anything is computed
+    require_options(space, starts, steps, tolerance, report)
     bounds = index_bounds(space, report=report) if bounds is None else require_bounds(bounds)
     slopes = weights / (bounds.upper - bounds.lower)
     found = maximize(space, slopes[None], starts=starts, steps=steps, tolerance=tolerance, report=report)[0]
@@ -125,6 +122,14 @@ def optimize_design(
 def require_space(space: Any, others: str = "") -> None:
     if not isinstance(space, DesignSpace):
         raise ValueError(f"space must come from design_space(...){others}, got {type(space).__name__}")
+
+
+def require_options(space: DesignSpace, starts: Any, steps: Any, tolerance: Any, report: Any) -> None:
+    """What is wrong is told before anything is computed."""
+    checks.is_function("report", report)
+    checks.is_count("steps", steps, most=100_000)
+    _tolerance(tolerance)
+    _start_boxes(space, starts)
 
 
 def _optimize_problem(problem, weights, bounds, starts, steps, tolerance, report) -> OptimizedDesign:

@@ -10,7 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from pk_jax import checks
-from pk_jax.design.optimize import Report, index_bounds, indices_and_slopes, maximize, require_space
+from pk_jax.design.optimize import (
+    Report,
+    index_bounds,
+    indices_and_slopes,
+    maximize,
+    require_options,
+    require_space,
+)
 from pk_jax.design.problem import DesignProblem
 from pk_jax.design.search import Search, advance, begin, must_fit, start_boxes
 from pk_jax.design.variables import DesignSpace
@@ -74,7 +81,7 @@ def pareto_designs(
     Weighted sums find the part of the front that lies on its convex hull.
     """
     require_space(space)
-    checks.is_function("report", report)
+    require_options(space, starts, steps, tolerance, report)
     weights = _weights(weights, 3)
     bounds = index_bounds(space, report=report)
     lower, ranges = np.asarray(bounds.lower), np.asarray(bounds.upper - bounds.lower)

@@ -137,12 +137,12 @@ def test_space_must_be_a_space():
 # --- ascent, on functions with known maxima
 
 
-def climb(function, starts, steps=60, tolerance=1e-9, values=None):
+def climb(function, starts, steps=60, tolerance=1e-9, values=None, first=None):
     def advance(state):
         return ascent.judge(state, *jax.value_and_grad(function)(ascent.propose(state)), tolerance)
 
     step = jax.jit(jax.vmap(advance))
-    states = jax.vmap(ascent.begin)(jnp.asarray(starts))
+    states = jax.vmap(ascent.begin)(jnp.asarray(starts)) if first is None else first
     for _ in range(steps):
         states = step(states)
         if values is not None:
@@ -175,6 +175,24 @@ def test_no_step_goes_down():
     values = []
     climb(wavy, STARTS, steps=24, values=values)
     assert np.all(np.diff(np.array(values), axis=0) >= 0)
+
+
+def test_a_climb_goes_on_by_a_better_rule():
+    """What the rough one said of the curvature saves most of the way."""
+    scales, target = jnp.array([1.0, 30.0, 5.0]), jnp.array([0.3, 1.7, 0.6])
+    true = lambda x: -jnp.sum(scales * (x - target) ** 2)
+    rough = climb(lambda x: true(x) + 1e-3 * jnp.sum(jnp.sin(x)), STARTS, tolerance=1e-2)
+    assert rough.is_done.all() and abs(rough.box - jnp.array([0.3, 1, 0.6])).max() > 1e-5
+    slopes = jax.vmap(jax.value_and_grad(true))(rough.box)
+    states = jax.vmap(lambda *lane: ascent.restated(*lane, 1e-9))(rough, *slopes)
+    np.testing.assert_array_equal(states.box, rough.box)
+    np.testing.assert_array_equal(states.value, slopes[0])
+    assert not states.is_done.any() and np.all(states.evaluations == rough.evaluations + 1)
+    ended = climb(true, STARTS, first=states)
+    np.testing.assert_allclose(ended.box, np.tile([0.3, 1.0, 0.6], (8, 1)), atol=1e-6)  # gains are roundoff
+    assert np.all(ended.is_done) and np.all(ended.evaluations - states.evaluations <= 6)
+    anew = jax.vmap(lambda *lane: ascent.restated(*lane, 1e-5))(ended, ended.value, ended.gradient)
+    assert anew.is_done.all()
 
 
 def test_a_nan_gradient_is_no_step_either():

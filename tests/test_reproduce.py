@@ -17,7 +17,7 @@ from scipy.optimize import minimize
 
 import pk_jax as pk
 from pk_jax.cli import main
-from pk_jax.design.optimize import maximize
+from pk_jax.design.optimize import indices_and_slopes, maximize
 from pk_jax.papers.nam2006_printed import MISPRINTS, TABLES
 
 pytestmark = pytest.mark.usefixtures("compiled_well")
@@ -166,6 +166,11 @@ def test_optima_of_the_2rrr(weights):
     assert found.history.objective[-1] == pytest.approx(found.objective, abs=1e-12)
     assert np.all(np.diff(found.history.objective) >= 0)
     assert len(found.history.objective) == found.evaluations < found.evaluations_in_all
+    indices = indices_and_slopes(RRR, found.history.vector)[0]  # by the true rule, also of the first steps
+    ranges = found.bounds.upper - found.bounds.lower
+    worth = (indices - found.bounds.lower) / ranges @ np.array(weights)
+    np.testing.assert_allclose(found.history.objective, worth, atol=1e-4)
+    np.testing.assert_allclose(found.history.objective[-3:], worth[-3:], atol=1e-12)
 
 
 @pytest.mark.parametrize("weights", R_OPTIMA)

@@ -79,6 +79,21 @@ def judge(state: Ascent, value: jax.Array, gradient: jax.Array, tolerance: float
     return jax.tree.map(lambda old, new: jnp.where(state.is_done, old, new), state, new)
 
 
+def restated(state: Ascent, value: jax.Array, gradient: jax.Array, tolerance: float) -> Ascent:
+    """The same point, its value and gradient found anew and better; what is known of the curvature stays."""
+    downhill = -jnp.where(is_free(state.box, gradient), gradient, 0)
+    aimed = _aim(
+        state._replace(
+            value=value,
+            gradient=gradient,
+            memory=state.memory._replace(updates=downhill),  # no step lies between the two gradients
+            cuts=jnp.zeros_like(state.cuts),
+            evaluations=state.evaluations + 1,
+        )
+    )
+    return aimed._replace(is_done=stationarity(state.box, gradient) <= tolerance)
+
+
 def shortened(state: Ascent, value: jax.Array) -> Ascent:
     """The trial, which had this value, is refused: a shorter step."""
     promised = state.gradient @ (propose(state) - state.box)

@@ -32,13 +32,14 @@ from pk_jax.mechanisms.base import Mechanism
 from pk_jax.status import Status
 
 BLOCK = 8  # designs evaluated by one call of the compiled function
+ROUGH_STILL = 1e-2  # projected gradient down to which the rough rule is followed
 ACTIVE_BELOW = 1e-9  # slack of a constraint that holds with equality
 
 Report = Callable[[str, int, int, float], None]  # what, steps done, steps allowed, best value
 
 
 class History(NamedTuple):
-    """One entry a step of the winning start."""
+    """One entry a step of the winning start; the first ones may come from a rougher rule, good to 1e-5."""
 
     vector: np.ndarray  # (steps, n) best design so far
     objective: np.ndarray  # (steps,)
@@ -58,7 +59,7 @@ class DesignResult(NamedTuple):
     multipliers: dict[str, float]  # of the active constraints, >= 0
     kkt: float  # greatest entry of grad(objective) + sum multiplier grad(slack)
     history: History
-    evaluations: int  # of value and gradient, along the winning start
+    evaluations: int  # of value and gradient, along the winning start, by any rule
     evaluations_in_all: int  # over all starts
     status: Status  # OK, STEP_LIMIT, or STALLED where the KKT residual stayed large
 
@@ -186,53 +187,85 @@ def maximize(
 
     answers = []
     final = trail[-1]
+    evaluations = np.array([state.evaluations for state in trail])
     for i in range(len(slopes)):
         lanes = slice(i * count, (i + 1) * count)
         best = i * count + int(np.nanargmax(final.value[lanes]))
-        own = int(final.evaluations[best])
-        box = np.array([state.box[best] for state in trail[:own]])
-        gradient = np.array([state.gradient[best] for state in trail[:own]])
+        own = [trail[row] for row in np.unique(evaluations[:, best], return_index=True)[1]]
+        box = np.array([state.box[best] for state in own])
+        gradient = np.array([state.gradient[best] for state in own])
         history = History(
             np.asarray(_from_boxes(space, box)),
-            np.array([state.value[best] for state in trail[:own]]),
+            np.array([state.value[best] for state in own]),
             ascent.stationarity(box, gradient),
         )
         in_all = int(final.evaluations[lanes].sum())
-        answers.append(Maximum(history.vector[-1], history, own, in_all, bool(final.is_done[best])))
+        answers.append(Maximum(history.vector[-1], history, len(own), in_all, bool(final.is_done[best])))
     return answers
 
 
 def _climb(space, slopes, boxes, steps, tolerance, report) -> list[ascent.Ascent]:
-    """Ascend from boxes (lanes, n) with slopes (lanes, 3). -> the states after every step"""
+    """Ascend from boxes (lanes, n) with slopes (lanes, 3). -> the states after every step
+
+    By the rough rule first, if the space has one; its values are moved by what the last of them is off.
+    """
+    tolerance = _tolerance(tolerance)
     states = jax.vmap(ascent.begin)(jnp.asarray(boxes))
+    rough = []
+    if space.rough is not None and steps > 1:
+        still = max(tolerance, ROUGH_STILL)
+        states, rough = _ascend(space, slopes, states, steps - 1, still, report, space.rough)
+        values = _values(space, slopes, states.box, None)
+        off = values[0] - rough[-1].value
+        rough = [state._replace(value=state.value + off) for state in rough]
+        states = _restated(states, *values, tolerance)
+        rough.append(jax.device_get(states._replace(memory=None)))
+    return rough + _ascend(space, slopes, states, steps, tolerance, report, None)[1]
+
+
+def _ascend(space, slopes, states, steps, tolerance, report, nodes):
+    """Until all are done, or were evaluated so many times. -> the last states, and all of them"""
     trail = []
-    running = np.arange(len(boxes))  # finished lanes are neither evaluated nor changed
-    value, gradient = np.zeros(len(boxes), boxes.dtype), np.zeros_like(boxes)
-    for done in range(1, steps + 1):
-        vectors, chain = (np.asarray(part)[running] for part in _propose(space, states))
-        indices, gradients = indices_and_slopes(space, vectors)
-        value[running] = np.einsum("li,li->l", slopes[running], indices)
-        gradient[running] = np.einsum("li,lij,ljk->lk", slopes[running], gradients, chain)
-        states = _judge(states, value, gradient, _tolerance(tolerance))
+    value, gradient = np.zeros(len(slopes), slopes.dtype), np.zeros(states.box.shape, slopes.dtype)
+    while True:
+        is_running = np.asarray(~states.is_done & (states.evaluations < steps))
+        if not is_running.any():  # those that are not are neither evaluated nor changed
+            return states, trail
+        trial = np.asarray(_propose(states))[is_running]
+        value[is_running], gradient[is_running] = _values(space, slopes[is_running], trial, nodes)
+        states = _judge(states, is_running, value, gradient, tolerance)
         trail.append(jax.device_get(states._replace(memory=None)))
         if report is not None:
+            done = int(trail[-1].evaluations.max())
             report(space.name, done, steps, float(np.nanmax(trail[-1].value)))
-        running = np.flatnonzero(~trail[-1].is_done)
-        if not len(running):
-            break
-    return trail
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _propose(space, states):
-    """Design vectors to evaluate (lanes, n), and their derivatives in the box (lanes, n, n)."""
-    boxes = jax.vmap(ascent.propose)(states)
-    return jax.vmap(space.from_box)(boxes), jax.vmap(jax.jacfwd(space.from_box))(boxes)
+def _values(space, slopes, boxes, nodes) -> tuple[np.ndarray, np.ndarray]:
+    """slopes (l, 3) @ indices at boxes (l, n), and its derivatives in the box. -> (l,), (l, n)"""
+    vectors, chain = (np.asarray(part) for part in _placed(space, boxes))
+    indices, gradients = indices_and_slopes(space, vectors, nodes)
+    return np.einsum("li,li->l", slopes, indices), np.einsum("li,lij,ljk->lk", slopes, gradients, chain)
+
+
+_propose = jax.jit(jax.vmap(ascent.propose))
+
+
+@functools.partial(jax.jit, static_argnums=4)
+def _judge(states, is_running, value, gradient, tolerance):
+    judged = jax.vmap(lambda *lane: ascent.judge(*lane, tolerance))(states, value, gradient)
+    choose = jax.vmap(lambda own, new, old: jax.tree.map(lambda a, b: jnp.where(own, a, b), new, old))
+    return choose(is_running, judged, states)
 
 
 @functools.partial(jax.jit, static_argnums=3)
-def _judge(states, value, gradient, tolerance):
-    return jax.vmap(lambda *lane: ascent.judge(*lane, tolerance))(states, value, gradient)
+def _restated(states, value, gradient, tolerance):
+    return jax.vmap(lambda *lane: ascent.restated(*lane, tolerance))(states, value, gradient)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _placed(space, boxes):
+    """Design vectors (lanes, n), and their derivatives in the box (lanes, n, n)."""
+    return jax.vmap(space.from_box)(boxes), jax.vmap(jax.jacfwd(space.from_box))(boxes)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -240,7 +273,9 @@ def _from_boxes(space, boxes):
     return jax.vmap(space.from_box)(boxes)
 
 
-def indices_and_slopes(space: DesignSpace, vectors: Any) -> tuple[np.ndarray, np.ndarray]:
+def indices_and_slopes(
+    space: DesignSpace, vectors: Any, nodes: tuple[int, int] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """(gii, gri, sui) of designs (k, n) and their Jacobians. -> (k, 3), (k, 3, n)
 
     Any number of designs goes through one compiled block, so that nothing compiles twice.
@@ -249,15 +284,15 @@ def indices_and_slopes(space: DesignSpace, vectors: Any) -> tuple[np.ndarray, np
     filled = np.concatenate([vectors, np.tile(vectors[-1], (-len(vectors) % BLOCK, 1))])
     blocks = filled.reshape(-1, BLOCK, vectors.shape[1])
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # a block keeps one core busy, no more
-        parts = list(pool.map(lambda block: jax.device_get(_block(space, block)), blocks))
+        parts = list(pool.map(lambda block: jax.device_get(_block(space, nodes, block)), blocks))
     indices, slopes = (np.concatenate(part)[: len(vectors)] for part in zip(*parts, strict=True))
     return indices, slopes
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _block(space, vectors):
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _block(space, nodes, vectors):
     def twice(vector):
-        indices = index_vector(workspace_indices(space.mechanism(vector)))
+        indices = index_vector(workspace_indices(space.mechanism(vector), nodes=nodes))
         return indices, indices
 
     slopes, indices = jax.vmap(jax.jacfwd(twice, has_aux=True))(vectors)

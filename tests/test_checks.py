@@ -230,6 +230,43 @@ def test_what_does_not_fit_into_memory_is_told_with_its_size(monkeypatch):
     assert str(caught.value) == "nodes = 99 would take 2.5 GB of memory, there are 2: take fewer"
 
 
+def test_a_container_may_have_less_memory_than_the_machine(monkeypatch, tmp_path):
+    machine = checks._memory.__wrapped__()
+    limits = tmp_path / "v2", tmp_path / "v1", tmp_path / "none"
+    monkeypatch.setattr(checks, "_CGROUP", list(map(str, limits)))
+    limits[0].write_text("max\n")
+    limits[1].write_text("2000000\n")
+    assert checks._memory.__wrapped__() == 2_000_000
+    limits[1].write_text(f"{2**62}\n")  # that of a container without a limit
+    assert checks._memory.__wrapped__() == machine
+
+
+def test_a_word_is_one_of_those_there_are():
+    assert checks.is_word("rule", "rays", ("rays", "panels")) == "rays"
+    for bad in ("ray", "", None, 3, ["rays"]):
+        with pytest.raises(ValueError, match=r"^rule must be one of rays, panels, got "):
+            checks.is_word("rule", bad, ("rays", "panels"))
+
+
+@pytest.mark.parametrize("good", [True, False, np.True_, np.False_])
+def test_a_flag_is_true_or_false(good):
+    assert checks.is_flag("certify", good) is bool(good)
+
+
+@pytest.mark.parametrize("bad", [0, 1, "yes", None, 1.0, np.ones(1, bool)])
+def test_what_is_neither_true_nor_false_is_no_flag(bad):
+    with pytest.raises(ValueError, match=r"^certify must be True or False, got "):
+        checks.is_flag("certify", bad)
+
+
+def test_functions_may_be_left_out():
+    checks.is_function("report", None)
+    checks.is_function("report", print)
+    for bad in ("print", 0, False, []):
+        with pytest.raises(ValueError, match=r"^report must be a function or None, got "):
+            checks.is_function("report", bad)
+
+
 def test_words_are_a_string_or_a_sequence():
     assert checks.are_words("axes", "x,y") == ("x", "y") == checks.are_words("axes", ["x", "y"])
     for bad in (3, ["x", 1], None):

@@ -193,6 +193,36 @@ def test_what_is_left_out_is_filled_in():
     assert set(settings_of(free.encode(), "mine.toml")["variables"]) == {"proximal", "distal"}
 
 
+def test_what_a_search_is_without_settings():
+    short = TEXT.split("[search]")[0].encode()
+    assert settings_of(short, "mine.toml")["search"] == dict(starts=16, steps=200, seed=0, tolerance=1e-8)
+
+
+COUNTED = {
+    "nodes": (2, 64),
+    "rays": (8, 10**6),
+    "replicates": (4, 16),
+    "cells": (8, 4096),
+    "seed": (0, 2**32 - 1),
+}
+
+
+@pytest.mark.parametrize("name", COUNTED)
+def test_counts_have_a_least_and_a_greatest(name):
+    text = lambda count: of_workspace(f"{name} = {count}").encode()
+    least, greatest = COUNTED[name]
+    for good in (least, greatest):
+        assert settings_of(text(good), "mine.toml")["objective"][name] == good
+    for bad in (least - 1, greatest + 1):
+        assert f"objective.{name} must be an integer from" in said_by(settings_of, text(bad), "mine.toml")
+
+
+def test_a_rectangle_has_a_greatest_number_of_poses():
+    text = lambda nodes: TEXT.replace("[3, 3]", nodes).encode()
+    assert settings_of(text("[400, 250]"), "mine.toml")["objective"]["nodes"] == [400, 250]
+    assert "must make at most 100000 poses" in said_by(settings_of, text("[401, 250]"), "mine.toml")
+
+
 def test_the_digest_is_that_of_the_meaning():
     digest = lambda text: run_file.digest_of(settings_of(text.encode(), "mine.toml"))
     same = f"# a comment\nname = 'mine'\n{TEXT.replace('[3, 3]', '3').replace('2.0', '2')}"
@@ -507,6 +537,22 @@ def test_checkpoints_of_others_are_refused(saved):
     fewer = {name: array if name == "history" else array[:5] for name, array in arrays.items()}
     assert "it must have 7 starts" in said(header, fewer)
     assert not (path.parent / "result.json").exists()
+
+
+def test_a_checkpoint_holds_the_arrays_of_its_header_and_numbers_only(tmp_path):
+    path = tmp_path / "x.npz"
+    path.write_bytes(checkpoint.packed({}, {"x": np.ones(2), "y": np.ones(3)}))
+    assert set(checkpoint.read_saved(path).arrays) == {"x", "y"}
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    without = {name: data for name, data in members.items() if name != "y.npy"}
+    for wrong in (without, {**members, "z.npy": members["x.npy"]}, {**without, "z.npy": members["y.npy"]}):
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, data in wrong.items():
+                archive.writestr(name, data)
+        assert "its arrays are others than its header says" in said_by(checkpoint.read_saved, path)
+    with pytest.raises(ValueError, match="Object arrays cannot be saved"):
+        checkpoint.packed({}, {"x": np.array([object()])})
 
 
 def test_a_checkpoint_of_other_versions_is_warned_of(saved):

@@ -398,6 +398,14 @@ class Mine(pk.TwoRPR):
     pass
 
 
+def test_the_unit_is_given_by_name(tmp_path):
+    mech, path = MECHANISMS["TwoRPR"], tmp_path / "robot.toml"
+    save_mechanism(mech=mech, path=path, unit="mm")
+    assert read_mechanism_file(path).unit == "mm"
+    with pytest.raises(TypeError):
+        save_mechanism(mech, path, "mm")
+
+
 def test_only_what_can_be_loaded_is_saved(tmp_path):
     path = tmp_path / "robot.toml"
     good = MECHANISMS["TwoRPR"]

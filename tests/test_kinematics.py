@@ -499,6 +499,20 @@ def test_a_missing_input_is_told(name):
     assert said_by(CALLS[name], None).startswith(f"{name} must ")
 
 
+def test_poses_in_another_unit_are_noticed_where_they_were_given():
+    there = [[900.0, 0.2, 0.1], [900.0, 0.3, 0.1]]
+    with pytest.warns(UserWarning, match="are they in one unit") as told:
+        pk.inverse_kinematics(PLANAR, there)
+    assert [each.filename for each in told] == [__file__]
+    pk.inverse_kinematics(PLANAR, [[0.1, 0.2, 900.0]])  # an angle may be any
+
+
+def test_a_mechanism_without_signs_has_one_working_mode():
+    assert pk.working_modes(RPR).shape == (1, 0)
+    np.testing.assert_array_equal(pk.working_modes(ARMS)[0], ARMS.default_branch())
+    assert {tuple(row) for row in pk.working_modes(ARMS)} == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
+
+
 def test_a_wrong_shape_is_written_like_a_shape():
     assert said_by(CALLS["pose"], [1.0, 2.0, 3.0]) == "pose must have shape (2,), got (3,)"
 

@@ -25,6 +25,7 @@ import sys
 import tempfile
 import time
 import tomllib
+import warnings
 from pathlib import Path
 
 from cosmic_ray.commands.init import init
@@ -72,12 +73,12 @@ def sample(mutants: list[MutationSpec], count: int, seed: int) -> list[MutationS
 def is_python(mutant: MutationSpec) -> bool:
     """A star of a signature that became a minus kills every test: that does not count."""
     operator = get_operator(mutant.operator_name)(**mutant.operator_args)
-    try:
-        compile(
-            mutate_code(Path(mutant.module_path).read_text(), operator, mutant.occurrence), "mutant", "exec"
-        )
-    except SyntaxError:
-        return False
+    code = mutate_code(Path(mutant.module_path).read_text(), operator, mutant.occurrence)
+    with warnings.catch_warnings(action="ignore"):
+        try:
+            compile(code, "mutant", "exec")
+        except SyntaxError:
+            return False
     return True
 
 
@@ -117,7 +118,7 @@ def tried(job: tuple[str, MutationSpec, str, float]) -> dict:
     lines = (result.diff or result.output).splitlines()
     return {
         "group": group,
-        "key": key_of(mutant),
+        "key": key_of(mutant, tests),
         "place": f"{mutant.module_path}:{mutant.start_pos[0]}",
         "was": "\n".join(line[1:].strip() for line in lines if re.match(r"-(?!--)", line)),
         "becomes": "\n".join(line[1:].strip() for line in lines if re.match(r"\+(?!\+\+)", line)),
@@ -126,9 +127,11 @@ def tried(job: tuple[str, MutationSpec, str, float]) -> dict:
     }
 
 
-def key_of(mutant: MutationSpec) -> str:
-    content = Path(mutant.module_path).read_bytes()
-    return f"{hashlib.sha256(content).hexdigest()[:16]} {mutant.operator_name} {mutant.occurrence}"
+def key_of(mutant: MutationSpec, tests: str) -> str:
+    """A result holds as long as the module and its tests are the same."""
+    files = [Path(mutant.module_path), *map(Path, tests.split())]
+    content = hashlib.sha256(b"".join(file.read_bytes() for file in files))
+    return f"{content.hexdigest()[:16]} {mutant.operator_name} {mutant.occurrence}"
 
 
 def show(groups: list[dict], results: list[dict], judged: list[dict]) -> int:
@@ -168,8 +171,9 @@ def main() -> int:
     results, queue = [], []
     for group in groups:
         chosen = sample(mutants_of(group["modules"]), options.sample or group["sample"], options.seed)
-        results += [known[key_of(each)] for each in chosen if key_of(each) in known]
-        queue += [(group, each) for each in chosen if key_of(each) not in known]
+        keys = [key_of(each, group["tests"]) for each in chosen]
+        results += [known[key] for key in keys if key in known]
+        queue += [(group, each) for each, key in zip(chosen, keys, strict=True) if key not in known]
     with tempfile.TemporaryDirectory(prefix="pk_jax_mutants_") as folder, kept.open("a") as file:
         copies = multiprocessing.Queue()
         for i in range(options.jobs):

@@ -546,6 +546,30 @@ def test_the_mean_of_a_quadratic_is_exact():
     np.testing.assert_allclose(lower, values.mean() - 2 * values.std(), rtol=1e-12)
 
 
+@pytest.mark.soak
+def test_the_composite_index_may_be_expected_of_links_that_are_made_with_errors():
+    """GII, GRI and SUI of Nam, Lee and Park 2006, by the integrals of any mechanism also off eq. (22)."""
+    bounds = pk.index_bounds(pk.design_space("2-rrr"))
+    five_bar = lambda v: pk.FiveBar(half_base=1.0, **v, reach=(1.3, 3.3))
+
+    def cpi(mech):
+        found = pk.workspace_integral(mech, ("isotropy", "resistivity"), rule="panels", nodes=8)
+        box = 2 * (mech.reach[0] + 1) * jnp.sqrt(mech.reach[1] ** 2 - 1)
+        return pk.composite_index(jnp.append(found.mean, found.volume / box), bounds)
+
+    problem = DesignProblem(five_bar, {"proximal": (0.9, 1.6), "distal": (2.2, 2.8)}, cpi)
+    own_rule = pk.workspace_indices(five_bar({"proximal": 1.05, "distal": 2.25}))
+    at_once = pk.evaluate_designs(problem, [[1.05, 2.25]], slopes=False)
+    np.testing.assert_allclose(at_once.objective[0, 0], pk.composite_index(own_rule, bounds), rtol=2e-3)
+    made = [1.1, 2.3] + 0.01 * normal_pairs(4, 2)
+    each = pk.evaluate_designs(problem, made)
+    expected = pk.evaluate_designs(
+        robust(problem, {"proximal": 0.01, "distal": 0.01}, samples=4), [[1.1, 2.3]]
+    )
+    np.testing.assert_allclose(expected.objective[0], each.objective.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(expected.objective_slopes[0], each.objective_slopes.mean(axis=0), rtol=1e-9)
+
+
 def test_the_worst_case_keeps_its_distance():
     """Maximize x where x <= 1 for every sample: the optimum is 1 less the largest error."""
     problem = point_problem(

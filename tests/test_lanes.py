@@ -345,3 +345,25 @@ def test_least_squares_of_nearly_dependent_columns():
     x = np.array([1.0, -2.0, 0.5])
     found, _ = _least_squares(matrix[None], (matrix @ x)[None])
     np.testing.assert_allclose(found[0], x, rtol=0, atol=64 * np.finfo(float).eps * np.linalg.cond(matrix))
+
+
+@jax.jit
+def _normal_equations(matrices, right):
+    rows = [[matrices[:, i, j] for j in range(matrices.shape[2])] for i in range(matrices.shape[1])]
+    gram = elimination.normal(rows)
+    factors = elimination.factor_symmetric(gram)
+    onto = lambda matrix: jnp.stack([jnp.stack(row, axis=1) for row in matrix], axis=1)
+    x = elimination.solve_symmetric(factors, [right[:, i] for i in range(right.shape[1])])
+    return onto(gram), jnp.stack(x, axis=1), onto(elimination.inverse_symmetric(factors))
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (9, 6), (3, 2), (5, 1)])
+def test_normal_equations_are_those_of_numpy(shape):
+    matrices, right = RANDOM.normal(size=(7, *shape)), RANDOM.normal(size=(7, shape[1]))
+    gram, x, inverse = _normal_equations(matrices, right)
+    expected = np.swapaxes(matrices, 1, 2) @ matrices
+    worst = np.linalg.cond(expected).max()
+    np.testing.assert_allclose(gram, expected, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(x, np.linalg.solve(expected, right[..., None])[..., 0], rtol=1e-13 * worst)
+    np.testing.assert_allclose(inverse @ expected, np.tile(np.eye(shape[1]), (7, 1, 1)), atol=1e-14 * worst)
+    np.testing.assert_array_equal(inverse, np.swapaxes(inverse, 1, 2))

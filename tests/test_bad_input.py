@@ -159,6 +159,9 @@ PYTHON = [  # number, what is called, how it is refused
     (31, lambda: pk.workspace_integral(five(), "isotropi"), "index must be a function or one of frobenius_i"),
     (31, lambda: pk.integral_gradient(lambda v: five(), [1.0], {}), "index must be a function or one of fro"),
     (31, lambda: pk.workspace_map(five(), "x,q"), "axes must be 2 to 3 different ones of x, y, got ('x', 'q"),
+    (31, lambda: pk.load_mechanism(""), "path must be the name of a file, got ''"),
+    (31, lambda: pk.load_mechanism(None), "path must be the name of a file, got None"),
+    (31, lambda: pk.save_mechanism(five(), ""), "path must be the name of a file, got ''"),
     (31, lambda: pk.catalogued("3-rrrr"), "no catalogue entry '3-rrrr'; there are nam-2-rpr"),
 ]  # fmt: skip
 

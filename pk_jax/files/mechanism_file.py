@@ -99,6 +99,8 @@ def save_mechanism(mech: Mechanism, path: str | os.PathLike, *, unit: str = "m")
 
 
 def _path(path: str | os.PathLike) -> Path:
+    if not isinstance(path, str | os.PathLike) or not os.fspath(path):
+        raise ValueError(f"path must be the name of a file, got {show(path)}")
     return Path(os.path.expanduser(path))  # that of pathlib raises where there is no such user
 
 

@@ -243,6 +243,9 @@ def test_lost_rows_have_their_status_and_change_no_other_row(found):
     for leaf in (mine.residual, mine.sigma_min, mine.det_sign, *jax.tree.leaves(mine.candidate)):
         assert np.all(np.isnan(np.asarray(leaf)[is_bad])) and np.all(np.isfinite(np.asarray(leaf)[~is_bad]))
     jax.tree.map(np.testing.assert_array_equal, take(mine, OTHERS), take(found, OTHERS))
+    ended = take(mine, AT[~is_bad[AT]])  # where the search ended is judged as solutions are
+    inverse = np.linalg.inv(lines(SEMI, ended.candidate))
+    np.testing.assert_allclose(ended.sigma_min, 1 / np.linalg.norm(inverse, axis=(1, 2)), rtol=1e-6)
 
 
 def test_one_lost_row_alone():

@@ -161,6 +161,45 @@ def test_every_working_mode_closes_the_loops_and_comes_back(build):
     np.testing.assert_allclose(np.asarray(back.pose)[is_ok], poses[is_ok], rtol=0, atol=1e-11)
 
 
+@pytest.mark.parametrize("name", ["3-rrr", "4-rrr", "6-link"])
+def test_drawn_links_are_rigid_and_hold_together(name):
+    mech = catalogued(name)
+    home, joints = mech.home()
+    pose = home + jnp.array([0.02, -0.03, 0.1])
+    links = np.array(mech.skeleton(home, joints).segments)
+    ends = [
+        np.asarray(mech.skeleton(*at).points)[links] for at in ((home, joints), (pose, mech.inverse(pose)))
+    ]
+    one, other = (np.linalg.norm(each[:, 0] - each[:, 1], axis=1) for each in ends)
+    np.testing.assert_allclose(one, other, rtol=1e-12)
+    assert set(links.ravel()) == set(range(links.max() + 1)) and len(set(map(frozenset, links))) == len(links)
+
+
+def test_home_stands_above_the_base_wherever_that_is():
+    base, platform = ends(3, 0)
+    links = {"proximal": 0.35, "distal": 0.36}
+    for build in (partial(pk.PlanarRRR, **links), pk.PlanarRPR):
+        home, joints = build(base=base, platform=platform).home()
+        moved, same = build(base=base + [3.0, -2.0], platform=platform).home()
+        np.testing.assert_allclose(moved, home + jnp.array([3.0, -2.0, 0]), atol=1e-9)
+        np.testing.assert_allclose(same, joints, atol=1e-9)
+    assert catalogued("6-link").home()[0][1] > 0
+
+
+@pytest.mark.parametrize("name", ["4-rrr", "4-rpr"])
+def test_modes_of_more_arms_than_needed_close_all_of_them(name):
+    mech = catalogued("4-rrr") if name == "4-rrr" else legs(4)
+    pose = mech.home()[0] + jnp.array([0.03, -0.02, 0.15])
+    joints = inverse(mech, pose, mech.default_branch() if name == "4-rrr" else None)
+    poses, is_real = forward(mech, joints)
+    found = np.asarray(poses)[np.asarray(is_real)]
+    assert len(found) >= 1 and np.abs(found - pose).max(axis=1).min() < 1e-9
+    for each in found:
+        np.testing.assert_allclose(
+            mech.residual(jnp.asarray(each), joints), 0, atol=1e-5 * mech.length() ** 2
+        )
+
+
 @pytest.mark.soak
 @pytest.mark.parametrize("build", [*ARMED.values(), lambda: legs(3)], ids=[*ARMED, "3-rpr"])
 def test_forward_of_inverse_is_the_identity_in_a_box(build):

@@ -358,6 +358,18 @@ def test_home_is_in_the_middle_of_the_stroke():
     np.testing.assert_allclose(np.mean(mech.home()[1] ** 2), np.mean(each.mean(axis=1) ** 2), rtol=1e-14)
 
 
+def test_home_does_not_know_where_the_frames_stand():
+    """That of the platform may have its origin anywhere, that of the base, too."""
+    rng = np.random.default_rng(4)
+    up, out = rng.normal(size=3), 3 * rng.normal(size=3)
+    base, platform = SEMI.base + 0.1 * rng.normal(size=(6, 3)), SEMI.platform + 0.1 * rng.normal(size=(6, 3))
+    pose, joints = pk.Stewart(base=base, platform=platform).home()
+    moved, same = pk.Stewart(base=base + up, platform=platform + out).home()
+    np.testing.assert_allclose(same, joints, rtol=1e-9)
+    np.testing.assert_allclose(moved.rotation, pose.rotation, atol=1e-9)
+    np.testing.assert_allclose(moved.translation, pose.translation + up - pose.rotation @ out, atol=1e-9)
+
+
 def test_home_passes_no_derivatives():
     pose = lambda mech: jax.tree.leaves(mech.home()[0])
     of_pose = jax.jit(jax.jacfwd(lambda scale: pose(jax.tree.map(lambda leaf: scale * leaf, SEMI))))(1.0)

@@ -106,7 +106,19 @@ def test_integers_and_float32():
 
 # ---------------------------------------------------------------- rotations
 
-ANGLES = [0, 1e-300, 1e-160, 1e-12, 1e-8, 1e-4, 1, 3, *(np.pi - np.array([1e-4, 1e-8, 1e-12, 0]))]
+ANGLES = [
+    0,
+    1e-300,
+    1e-160,
+    1e-12,
+    1e-8,
+    1e-4,
+    0.0999,
+    0.1999,
+    1,
+    3,
+    *(np.pi - np.array([1e-4, 1e-8, 1e-12, 0])),
+]
 TILTED = Rotation.random(rng=np.random.default_rng(5)).as_matrix()
 AXES = np.concatenate([np.eye(3), -np.eye(3), TILTED])
 VECTORS = np.concatenate([angle * AXES for angle in ANGLES])

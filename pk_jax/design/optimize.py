@@ -215,7 +215,7 @@ def _climb(space, slopes, boxes, steps, tolerance, report) -> list[ascent.Ascent
     if space.rough is not None and steps > 1:
         still = max(tolerance, ROUGH_STILL)
         states, rough = _ascend(space, slopes, states, steps - 1, still, report, space.rough)
-        values = _values(space, slopes, states.box, None)
+        values = _values(space, slopes, states.box, slice(None), None)
         off = values[0] - rough[-1].value
         rough = [state._replace(value=state.value + off) for state in rough]
         states = _restated(states, *values, tolerance)
@@ -231,8 +231,8 @@ def _ascend(space, slopes, states, steps, tolerance, report, nodes):
         is_running = np.asarray(~states.is_done & (states.evaluations < steps))
         if not is_running.any():  # those that are not are neither evaluated nor changed
             return states, trail
-        trial = np.asarray(_propose(states))[is_running]
-        value[is_running], gradient[is_running] = _values(space, slopes[is_running], trial, nodes)
+        found = _values(space, slopes, _propose(states), is_running, nodes)
+        value[is_running], gradient[is_running] = found
         states = _judge(states, is_running, value, gradient, tolerance)
         trail.append(jax.device_get(states._replace(memory=None)))
         if report is not None:
@@ -240,10 +240,11 @@ def _ascend(space, slopes, states, steps, tolerance, report, nodes):
             report(space.name, done, steps, float(np.nanmax(trail[-1].value)))
 
 
-def _values(space, slopes, boxes, nodes) -> tuple[np.ndarray, np.ndarray]:
-    """slopes (l, 3) @ indices at boxes (l, n), and its derivatives in the box. -> (l,), (l, n)"""
-    vectors, chain = (np.asarray(part) for part in _placed(space, boxes))
+def _values(space, slopes, boxes, chosen, nodes) -> tuple[np.ndarray, np.ndarray]:
+    """slopes @ indices at the chosen l of the boxes, and its derivatives in the box. -> (l,), (l, n)"""
+    vectors, chain = (np.asarray(part)[chosen] for part in _placed(space, boxes))
     indices, gradients = indices_and_slopes(space, vectors, nodes)
+    slopes = slopes[chosen]
     return np.einsum("li,li->l", slopes, indices), np.einsum("li,lij,ljk->lk", slopes, gradients, chain)
 
 

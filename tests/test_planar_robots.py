@@ -186,6 +186,18 @@ def test_home_stands_above_the_base_wherever_that_is():
     assert catalogued("6-link").home()[0][1] > 0
 
 
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
+def test_modes_are_those_of_any_unit(scale):
+    base, platform = ends(3, 0)
+    one = pk.PlanarRPR(base=base, platform=platform)
+    joints = np.asarray(one.home()[1])
+    poses, is_real = forward(one, joints)
+    other, also_real = forward(pk.PlanarRPR(base=scale * base, platform=scale * platform), scale * joints)
+    np.testing.assert_array_equal(is_real, also_real)
+    assert 2 <= np.sum(is_real) <= 6
+    np.testing.assert_allclose(other / np.array([scale, scale, 1]), poses, atol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["4-rrr", "4-rpr"])
 def test_modes_of_more_arms_than_needed_close_all_of_them(name):
     mech = catalogued("4-rrr") if name == "4-rrr" else legs(4)

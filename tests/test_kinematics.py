@@ -422,6 +422,21 @@ def test_jit_and_vmap_change_nothing():
     np.testing.assert_allclose(found.pose, batch.pose, rtol=0, atol=1e-14)
 
 
+def test_many_traced_rows_are_those_of_known_ones():
+    """From 4096 rows on they go on lanes, and those that are lost are tried once more."""
+    home = np.asarray(PLANAR.home()[0])
+    poses = home + 0.3 * np.random.default_rng(6).uniform(-1, 1, (4096, 3))
+    joints = np.array(pk.inverse_kinematics(PLANAR, poses).joints)
+    joints[[7, 900]], joints[8, 1] = [[9.0, 0.1, 0.1], [0.01, 5.0, 0.2]], NAN
+    known, traced = (
+        solve(PLANAR, joints) for solve in (pk.forward_kinematics, jax.jit(pk.forward_kinematics))
+    )
+    np.testing.assert_array_equal(traced.status, known.status)
+    assert np.sum(known.status == Status.OK) > 4000 and not np.any(known.status[np.array([7, 8, 900])] == 0)
+    np.testing.assert_allclose(traced.pose, known.pose, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(traced.sigma_min, known.sigma_min, rtol=1e-6)
+
+
 def test_a_batch_of_mechanisms():
     sizes = np.array([1.0, 2.0, 1000.0])
     mechs = jax.vmap(lambda s: jax.tree.map(lambda leaf: leaf * s, ARMS))(sizes)

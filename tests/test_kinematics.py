@@ -532,6 +532,13 @@ def test_a_wrong_shape_is_written_like_a_shape():
     assert said_by(CALLS["pose"], [1.0, 2.0, 3.0]) == "pose must have shape (2,), got (3,)"
 
 
+def test_a_redundant_distance_is_positive():
+    casing = pk.CasingOscillator()
+    rows = [0.73, 0.0, -1.0, NAN]
+    found = pk.inverse_kinematics(casing, casing.home()[0], free=np.array(rows)[:, None])
+    assert statuses(found) == ["OK", "BAD_INPUT", "BAD_INPUT", "BAD_INPUT"]
+
+
 @pytest.mark.parametrize("branch", [[0, 1], [1, 2], [1, -0.5], [NAN, 1], [INF, 1], [[1, 1], [1, 3]]])
 def test_a_branch_holds_signs(branch):
     assert "+1 and -1" in said_by(CALLS["branch"], branch)

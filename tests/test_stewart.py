@@ -39,6 +39,8 @@ SHEAR = np.array([[1.0, 2e-5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 def test_what_is_not_orthonormal_is_refused_with_its_row():
     said = said_by(pk.SE3, np.zeros((4, 3)), turned(4, 2, SHEAR))
     assert said.startswith("SE3.rotation[2] must be orthonormal") and said.endswith("2e-05")
+    both = np.stack([np.eye(3), SHEAR, 1.01 * np.eye(3)])
+    assert said_by(pk.SE3, np.zeros((3, 3)), both).startswith("SE3.rotation[1] must be")  # the first one
     assert said_by(pk.SE3, np.zeros(3), 1.01 * np.eye(3)).startswith("SE3.rotation must be orthonormal")
     assert said_by(pk.SE3, np.zeros(3), np.zeros((3, 3))).startswith("SE3.rotation must be orthonormal")
 

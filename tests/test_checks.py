@@ -230,6 +230,14 @@ def test_what_does_not_fit_into_memory_is_told_with_its_size(monkeypatch):
     assert str(caught.value) == "nodes = 99 would take 2.5 GB of memory, there are 2: take fewer"
 
 
+def test_rows_need_four_times_their_size(monkeypatch):
+    """For what is made of them."""
+    monkeypatch.setattr(checks, "_memory", lambda: 4 * 8 * 100.0)
+    checks.real_numpy("x", np.ones(100))
+    with pytest.raises(ValueError, match=r"^x would take .* of memory"):
+        checks.real_numpy("x", np.ones(101))
+
+
 def test_a_container_may_have_less_memory_than_the_machine(monkeypatch, tmp_path):
     machine = checks._memory.__wrapped__()
     limits = tmp_path / "v2", tmp_path / "v1", tmp_path / "none"

@@ -9,6 +9,7 @@ from outsiders import delta, implicit_delta, three_legs, three_rpr
 
 import pk_jax as pk
 from pk_jax import Status
+from pk_jax.kinematics import batching
 
 RPR = pk.TwoRPR(half_base=1.0, l_min=1.0, l_max=3.0)
 ARMS = pk.FiveBar(half_base=1.0, proximal=1.0, distal=2.15)
@@ -434,6 +435,14 @@ def test_many_traced_rows_are_those_of_known_ones():
     assert np.sum(known.status == Status.OK) > 4000 and not np.any(known.status[np.array([7, 8, 900])] == 0)
     np.testing.assert_allclose(traced.pose, known.pose, rtol=0, atol=1e-12)
     np.testing.assert_allclose(traced.sigma_min, known.sigma_min, rtol=1e-6)
+
+
+def test_a_constant_has_no_derivatives_of_any_kind_of_number():
+    constant = batching.without_derivatives(lambda x: (jnp.sin(x), jnp.argmax(x)))
+    found, slopes = jax.jvp(constant, (jnp.arange(3.0),), (jnp.ones(3),))
+    np.testing.assert_array_equal(found[0], np.sin(np.arange(3.0)))
+    np.testing.assert_array_equal(slopes[0], np.zeros(3))
+    assert slopes[0].dtype == jnp.float64 and slopes[1].dtype == jax.dtypes.float0
 
 
 def test_a_batch_of_mechanisms():

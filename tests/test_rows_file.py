@@ -118,6 +118,12 @@ BAD = {
 }
 
 
+def test_a_line_may_have_a_mebibyte(read):
+    line = "1,2,3" + ",0" * (2**19 - 3) + "\n"
+    assert len(line) == 2**20
+    np.testing.assert_array_equal(read(line, columns="1,2,3"), [[1, 2, 3]])
+
+
 @pytest.mark.parametrize("chunk", [1, 100])
 @pytest.mark.parametrize(("content", "expected"), BAD.values(), ids=BAD)
 def test_what_is_wrong_is_told_with_its_line(read, content, expected, chunk):

@@ -6,8 +6,10 @@
 
 cosmic-ray writes the mutants, each in a copy of the checkout, and runs the tests that tools/mutants.toml
 names for the module. A sample takes places of the code, then one mutant at each. Results are kept as they
-come: a run that was interrupted goes on where it stopped. Survivors are printed with the judgement that the
-file holds of them. Exit code 1 where fewer than nine in ten are killed or a survivor is not judged.
+come: a run that was interrupted goes on where it stopped, and survivors are tried again when their tests
+have changed. Survivors are printed with the judgement that the file holds of them; those that give the same
+answers as the code ("same") can't be killed and don't count. Exit code 1 where fewer than nine in ten of the
+others are killed, or a survivor is not judged.
 """
 
 from __future__ import annotations
@@ -118,7 +120,8 @@ def tried(job: tuple[str, MutationSpec, str, float]) -> dict:
     lines = (result.diff or result.output).splitlines()
     return {
         "group": group,
-        "key": key_of(mutant, tests),
+        "key": key_of(mutant),
+        "tests": digest(tests.split()),
         "place": f"{mutant.module_path}:{mutant.start_pos[0]}",
         "was": "\n".join(line[1:].strip() for line in lines if re.match(r"-(?!--)", line)),
         "becomes": "\n".join(line[1:].strip() for line in lines if re.match(r"\+(?!\+\+)", line)),
@@ -127,11 +130,12 @@ def tried(job: tuple[str, MutationSpec, str, float]) -> dict:
     }
 
 
-def key_of(mutant: MutationSpec, tests: str) -> str:
-    """A result holds as long as the module and its tests are the same."""
-    files = [Path(mutant.module_path), *map(Path, tests.split())]
-    content = hashlib.sha256(b"".join(file.read_bytes() for file in files))
-    return f"{content.hexdigest()[:16]} {mutant.operator_name} {mutant.occurrence}"
+def key_of(mutant: MutationSpec) -> str:
+    return f"{digest([mutant.module_path])} {mutant.operator_name} {mutant.occurrence}"
+
+
+def digest(files: list[str]) -> str:
+    return hashlib.sha256(b"".join(Path(file).read_bytes() for file in files)).hexdigest()[:16]
 
 
 def show(groups: list[dict], results: list[dict], judged: list[dict]) -> int:
@@ -140,16 +144,19 @@ def show(groups: list[dict], results: list[dict], judged: list[dict]) -> int:
     for group in groups:
         own = [each for each in results if each["group"] == group["name"]]
         print(f"{group['name']:<14}{len(own):>8}{killed(own):>8}")
-    share = killed(results) / max(len(results), 1)
-    print(f"{'all':<14}{len(results):>8}{killed(results):>8}   {share:.1%}")
-    unjudged = 0
-    for each in results:
-        if each["outcome"] != "killed":
-            same = lambda known, each=each: (known["was"], known["becomes"]) == (each["was"], each["becomes"])
-            why = next((known["why"] for known in judged if same(known)), None)
-            unjudged += why is None
-            print(f"\n{each['place']} {each['outcome']}: {why or 'not judged yet'}")
-            print(f"  - {each['was']}\n  + {each['becomes']}")
+    unjudged, same = 0, 0
+    survivors = [each for each in results if each["outcome"] != "killed"]
+    for each in survivors:
+        found = [one for one in judged if (one["was"], one["becomes"]) == (each["was"], each["becomes"])]
+        each["why"] = found[0]["why"] if found else "not judged yet"
+        unjudged += not found
+        same += bool(found and found[0].get("same"))
+    share = killed(results) / max(len(results) - same, 1)
+    print(f"{'all':<14}{len(results):>8}{killed(results):>8}   {killed(results) / max(len(results), 1):.1%}")
+    print(f"{same} of the {len(survivors)} survivors give the same answers; of the others killed {share:.1%}")
+    for each in survivors:
+        print(f"\n{each['place']} {each['outcome']}: {each['why']}")
+        print(f"  - {each['was']}\n  + {each['becomes']}")
     return int(share < WANTED or unjudged > 0)
 
 
@@ -171,9 +178,13 @@ def main() -> int:
     results, queue = [], []
     for group in groups:
         chosen = sample(mutants_of(group["modules"]), options.sample or group["sample"], options.seed)
-        keys = [key_of(each, group["tests"]) for each in chosen]
-        results += [known[key] for key in keys if key in known]
-        queue += [(group, each) for each, key in zip(chosen, keys, strict=True) if key not in known]
+        now = digest(group["tests"].split())
+        for each in chosen:
+            found = known.get(key_of(each))
+            if found and (found["outcome"] == "killed" or found["tests"] == now):
+                results.append(found)
+            else:
+                queue.append((group, each))
     with tempfile.TemporaryDirectory(prefix="pk_jax_mutants_") as folder, kept.open("a") as file:
         copies = multiprocessing.Queue()
         for i in range(options.jobs):

@@ -267,6 +267,13 @@ def test_what_is_neither_true_nor_false_is_no_flag(bad):
         checks.is_flag("certify", bad)
 
 
+def test_ranges_are_a_dict():
+    assert checks.is_dict("ranges", {"x": (0, 1)}) == {"x": (0, 1)}
+    for bad in (None, [("x", (0, 1))], "x"):
+        with pytest.raises(ValueError, match=r"^ranges must be a dict, name -> \(lower, upper\), got "):
+            checks.is_dict("ranges", bad)
+
+
 def test_functions_may_be_left_out():
     checks.is_function("report", None)
     checks.is_function("report", print)

@@ -100,8 +100,8 @@ class RowReader:
         more = list(islice(self._lines, self.chunk - len(lines)))
         self._waiting = []
         if max(map(len, more), default=0) > LONGEST:
-            for number, line in enumerate(more, self.line + 1):
-                self._split(line, number)  # told there
+            for number, line in enumerate(more, self.line + 1):  # pragma: no branch: the line is told
+                self._split(line, number)
         self.line += len(more)
         self.seen += sum(map(len, more))
         return lines + more

@@ -330,6 +330,11 @@ def made_square(name):
     return name not in REDUNDANT
 
 
+def closed_to(name):
+    """How far a row that is OK may be from closed, over its size."""
+    return EXACT if made_square(name) else NOT_INCONSISTENT
+
+
 def told(name, what, counts):
     print(f"{name}, {what}: " + ", ".join(f"{count} {key}" for key, count in counts.items() if count))
 
@@ -363,10 +368,17 @@ def test_there_and_back(name, rows):
         pose, joints = take(pose, is_ok), solved.joints[is_ok]
         found = numpy(pk.forward_kinematics(mech, joints))
         sign = np.full(len(joints), home_side(name))
-        is_back = assert_true(name, joints, found, EXACT, sign)
+        is_back = assert_true(name, joints, found, closed_to(name), sign)
         is_itself = is_back & (apart(found.pose, pose) <= 1e-6 * seen.size)
-        if made_square(name):  # nobody comes back from beyond a singularity
-            assert np.all(side(name, pose, joints)[is_itself] == home_side(name))
+        if made_square(name):  # nobody comes back from beyond a singularity, unless the two poses are one
+            is_regular = is_itself & (found.sigma_min > 1e-4)
+            assert np.all(side(name, pose, joints)[is_regular] == home_side(name))
+        else:  # another mode of some legs may close the others to 1e-6 by chance: the residual says so
+            gap = drawn(name, take(found.pose, is_back), joints[is_back]).gap / seen.size[is_back]
+            by_chance = gap > EXACT
+            assert np.sum(by_chance) <= max(1, count * 1e-4)
+            assert np.all(found.residual[is_back][by_chance] > EXACT * seen.size[is_back][by_chance])
+            counts["closed by chance"] += int(np.sum(by_chance))
         counts += statuses(found) + Counter(
             {"out of reach": int(np.sum(~is_ok)), "itself": int(is_itself.sum())}
         )
@@ -383,7 +395,7 @@ def test_from_any_guess(name, rows):
         joints = joints[np.all(np.isfinite(joints), axis=1)]
         guess = some_poses(name, len(joints), rng)
         found = numpy(pk.forward_kinematics(mech, joints, guess))
-        assert_true(name, joints, found, EXACT, side(name, guess, joints))
+        assert_true(name, joints, found, closed_to(name), side(name, guess, joints))
         counts += statuses(found)
     told(name, "from any guess", counts)
     assert counts["OK"] > rows / 1000
@@ -393,7 +405,7 @@ def test_from_any_guess(name, rows):
 def test_joints_that_no_pose_has(name, rows):
     """Two legs and the distances of their ends make no quadrilateral: nothing says that there is a pose."""
     mech, counts = made(name), Counter()
-    allowed = EXACT if made_square(name) else NOT_INCONSISTENT
+    allowed = closed_to(name)
     for rng, count in in_blocks(rows // 10, name):
         joints = some_joints(name, count, rng)
         guess = some_poses(name, count, rng)
